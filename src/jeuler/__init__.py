@@ -1,0 +1,26 @@
+"""jeuler: differentiable Euler integration of springs, particles and ODEs in JAX."""
+
+from jeuler.effects import PrescribedMotion, SampledPath
+from jeuler.forces import Gravity, QuadraticDrag, Springs
+from jeuler.methods import euler_step, heun_step, rk4_step, symplectic_euler_step
+from jeuler.particles import ParticleState, Scene, simulate
+from jeuler.solve import Solution, solve
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Gravity",
+    "ParticleState",
+    "PrescribedMotion",
+    "QuadraticDrag",
+    "SampledPath",
+    "Scene",
+    "Solution",
+    "Springs",
+    "euler_step",
+    "heun_step",
+    "rk4_step",
+    "simulate",
+    "solve",
+    "symplectic_euler_step",
+]

@@ -1,0 +1,96 @@
+"""Checks of what a person passed: one clear ValueError each, at call time, before anything is traced.
+
+Values that are being traced cannot be looked at, so value checks pass over them; types and shapes are always seen.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def is_traced(x: Any) -> bool:
+    return isinstance(x, jax.core.Tracer)
+
+
+def number(name: str, x: Any) -> None:
+    """x is a finite real scalar."""
+    expected = f"{name} must be one finite real number"
+    if is_traced(x):
+        if x.ndim or not jnp.issubdtype(x.dtype, jnp.floating):
+            raise ValueError(f"{expected}, got a traced {x.dtype} of shape {x.shape}")
+        return
+    try:
+        array = np.asarray(x, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{expected}, got {x!r}") from None
+    if array.ndim or isinstance(x, (bool, np.bool_, str)):
+        raise ValueError(f"{expected}, got {x!r}; for a batch use jax.vmap")
+    if not math.isfinite(array):
+        raise ValueError(f"{expected}, got {x!r}")
+
+
+def positive(name: str, x: Any, unit: str = "") -> None:
+    """x is a finite real scalar above zero."""
+    number(name, x)
+    if not is_traced(x) and not float(x) > 0:
+        raise ValueError(f"{name} must be greater than 0{unit and ' ' + unit}, got {x!r}")
+
+
+def count(name: str, x: Any, *, least: int = 0) -> int:
+    """x as a Python int of at least ``least``: it fixes the shape of the program, so it cannot be traced."""
+    try:
+        if isinstance(x, (bool, np.bool_)):
+            raise TypeError
+        n = operator.index(x)
+    except (TypeError, jax.errors.TracerIntegerConversionError):
+        hint = "mark it static (static_argnames) under jit" if is_traced(x) else f"pass int({name})"
+        raise ValueError(f"{name} must be a Python integer, got {x!r}; {hint}") from None
+    if n < least:
+        raise ValueError(f"{name} must be at least {least}, got {n}")
+    return n
+
+
+def path_name(path: tuple) -> str:
+    """A leaf's place in a pytree, to be read by a person."""
+    return jax.tree_util.keystr(path) or "y"
+
+
+def state(name: str, y: Any) -> Any:
+    """y as a pytree of strongly typed floating or complex arrays."""
+
+    def leaf(path, x):
+        try:
+            dtype = jnp.result_type(x)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name}{jax.tree_util.keystr(path)} must be an array, got {x!r}") from None
+        if not jnp.issubdtype(dtype, jnp.inexact):
+            raise ValueError(
+                f"{name}{jax.tree_util.keystr(path)} must be floating, got {dtype}; "
+                f"convert it, for example jnp.asarray(x, dtype=float)"
+            )
+        return jax.lax.convert_element_type(x, jax.dtypes.canonicalize_dtype(dtype))
+
+    return jax.tree_util.tree_map_with_path(leaf, y)
+
+
+def same_form(what: str, y: Any, dy: Any) -> None:
+    """dy (shapes and dtypes are enough) has the structure and shapes of y and does not widen its dtypes."""
+    expected, came = jax.tree.structure(y), jax.tree.structure(dy)
+    if expected != came:
+        raise ValueError(f"{what} must return the structure of the state, {expected}, got {came}")
+    came_leaves = jax.tree.leaves(dy)
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(y), came_leaves, strict=True):
+        where = path_name(path)
+        if jnp.shape(a) != jnp.shape(b):
+            raise ValueError(f"{what} must keep the shape of {where}, {jnp.shape(a)}, got {jnp.shape(b)}")
+        if jnp.result_type(a, b) != a.dtype:
+            raise ValueError(
+                f"{what} must keep the dtype of {where}, {a.dtype}, got {b.dtype}; "
+                f"cast what it returns, or the state, so that the two agree"
+            )

@@ -1,0 +1,126 @@
+"""Arithmetic on pytrees, and the one decorator that makes a component a frozen pytree."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+PyTree = Any
+T = TypeVar("T")
+
+
+def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
+    """Make a class a frozen dataclass that is also a pytree.
+
+    Fields named in ``static`` are part of the structure (hashable, fixed while tracing), all others are
+    children. Unflattening does not call ``__init__``, so a ``__post_init__`` sees what a person passed and never a
+    transformation's placeholder.
+    """
+
+    @dataclass_transform(frozen_default=True)
+    def decorate(cls: type[T]) -> type[T]:
+        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+        names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]
+        children = tuple(name for name in names if name not in static)
+        keys = tuple(jax.tree_util.GetAttrKey(name) for name in children)
+
+        def flatten(x: T):
+            return tuple(getattr(x, n) for n in children), tuple(getattr(x, n) for n in static)
+
+        def flatten_with_keys(x: T):
+            return tuple((k, getattr(x, n)) for k, n in zip(keys, children, strict=True)), tuple(
+                getattr(x, n) for n in static
+            )
+
+        def unflatten(aux: tuple, values: tuple) -> T:
+            x = object.__new__(cls)
+            for name, value in zip((*children, *static), (*values, *aux), strict=True):
+                object.__setattr__(x, name, value)
+            return x
+
+        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+        return cls
+
+    return decorate
+
+
+def as_float(x: ArrayLike | None) -> Array | None:
+    """A parameter as a floating array; Python numbers stay weakly typed, so they follow the state's dtype."""
+    if x is None or isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact):
+        return x
+    if isinstance(x, (bool, int, float)):
+        return jnp.asarray(float(x))
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
+
+
+def store_as_float(component: Any, *names: str) -> None:
+    """For ``__post_init__``: replace the named fields by floating arrays."""
+    for name in names:
+        object.__setattr__(component, name, as_float(getattr(component, name)))
+
+
+@component(static=("function",))
+class Function:
+    """A plain function in a place where a pytree is expected: all of it is static."""
+
+    function: Callable
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+
+def as_component(x: Any) -> Any:
+    """x if it is a pytree of arrays already; a plain function is wrapped, so that no leaf is a function."""
+    return Function(x) if callable(x) and jax.tree_util.all_leaves([x]) else x
+
+
+def real_dtype(dtype: Any) -> Any:
+    """The dtype of the real part: float32 for complex64."""
+    return jnp.finfo(dtype).dtype
+
+
+def time_dtype(y: PyTree) -> Any:
+    """The dtype of t and dt for a state: its widest real dtype, float32 at least."""
+    leaves = [real_dtype(leaf.dtype) for leaf in jax.tree.leaves(y)]
+    return jnp.result_type(jnp.float32, *leaves) if leaves else jnp.result_type(float)
+
+
+def add(x: PyTree, y: PyTree) -> PyTree:
+    """x + y, leaf by leaf."""
+    return jax.tree.map(lambda a, b: a + b, x, y)
+
+
+def scale(a: ArrayLike, x: PyTree) -> PyTree:
+    """a x, leaf by leaf, for a real scalar a taken to each leaf's precision."""
+
+    def leaf(v):
+        v = jnp.asarray(v)
+        if not jnp.issubdtype(v.dtype, jnp.inexact):  # an integer slope, such as jnp.zeros(n, int)
+            return jnp.asarray(a) * v
+        return jnp.asarray(a).astype(real_dtype(v.dtype)) * v
+
+    return jax.tree.map(leaf, x)
+
+
+def combine(weights: tuple[float, ...], trees: list[PyTree]) -> PyTree:
+    """sum_i w_i x_i over pytrees; terms whose weight is zero are never computed."""
+    terms = [scale(w, x) if w != 1.0 else x for w, x in zip(weights, trees, strict=True) if w != 0.0]
+    total = terms[0]
+    for term in terms[1:]:
+        total = add(total, term)
+    return total
+
+
+def all_finite(y: PyTree) -> Array:
+    """Whether every number in y is finite, a boolean scalar."""
+    finite = jnp.asarray(True)
+    for leaf in jax.tree.leaves(y):
+        finite &= jnp.all(jnp.isfinite(leaf))
+    return finite

@@ -1,0 +1,119 @@
+"""Particles whose motion is given: hands that hold a rope, a head that carries hair."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler import _tree
+from jeuler._interpolate import interpolate, slopes
+
+
+@_tree.component()
+class SampledPath:
+    """A path through samples, as a motion capture gives it: piecewise cubic, with slopes from finite differences.
+
+    Before the first sample and after the last the path rests there.
+
+    Args:
+      times: increasing sample times, shape (sample,), s; two at least.
+      positions: sample positions, shape (sample, ...), m. Differentiable.
+    Returns: called as ``path(t)``, the position at time t, shape (...), m.
+    Raises: ValueError, if times decrease or repeat, or if the two lengths differ.
+    Example:
+      >>> import jeuler
+      >>> path = jeuler.SampledPath([0.0, 1.0, 2.0], [[0.0, 0.0], [1.0, 1.0], [2.0, 4.0]])
+      >>> path(1.5).tolist()
+      [1.5, 2.25]
+    Source: C. de Boor, A Practical Guide to Splines, 1978, ch. IV (cubic Hermite interpolation).
+    """
+
+    times: Array
+    positions: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "times", "positions")
+        times = self.times
+        if times.ndim != 1 or len(times) < 2 or len(self.positions) != len(times):
+            raise ValueError(
+                f"times must have shape (sample,) with two samples at least and positions (sample, ...), "
+                f"got {times.shape} and {self.positions.shape}"
+            )
+        if not isinstance(times, jax.core.Tracer) and not (np.diff(np.asarray(times)) > 0).all():
+            raise ValueError("times must increase from sample to sample; sort the samples and drop repeated times")
+
+    def __call__(self, t: Any) -> Array:
+        return interpolate(t, self.times, self.positions, slopes(self.times, self.positions))
+
+
+@_tree.component(static=("particles",))
+class PrescribedMotion:
+    """Particles that follow a given path, whatever forces act on them.
+
+        p_k(t) = path(t)_k,   v_k(t) = d path_k / dt
+
+    Springs feel their exact position and velocity at every stage of every step. Give them mass = inf, or any mass.
+
+    Args:
+      particles: indices of the prescribed particles, integers (prescribed,). Static.
+      path: a function ``path(t) -> (prescribed, dim)`` in m, or a `SampledPath`. A path that is a pytree, such as
+        `SampledPath` or ``jax.tree_util.Partial``, is differentiable in its leaves.
+    Returns: called as an effect ``(t, dt, state, key)``, the state with these particles on their path at time t.
+    Raises: ValueError, in `simulate`, if an index is out of range or repeated, or the path has another shape.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> hand = jeuler.PrescribedMotion([0], lambda t: jnp.stack([jnp.sin(t), 0.0 * t])[None])
+      >>> state = jeuler.ParticleState(jnp.zeros((1, 2)), jnp.zeros((1, 2)))
+      >>> end = jeuler.simulate(jeuler.Scene(effects=(hand,)), state, dt=0.5, num_steps=2)
+      >>> round(float(end.y.position[-1, 0, 0]), 5), round(float(end.y.velocity[-1, 0, 0]), 5)
+      (0.84147, 0.5403)
+    Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 4 (user interaction).
+    """
+
+    particles: tuple[int, ...]
+    path: Any
+
+    def __post_init__(self) -> None:
+        particles = tuple(int(k) for k in np.asarray(self.particles).ravel())
+        object.__setattr__(self, "particles", particles)
+        object.__setattr__(self, "path", _tree.as_component(self.path))
+
+    def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """Position and velocity with the prescribed ones put in."""
+        p, v = self._position_and_velocity(t, position.dtype)
+        return self._put(position, p), self._put(velocity, v)
+
+    def constrain_slope(self, t: Any, velocity: Array, acceleration: Array) -> tuple[Array, Array]:
+        """Velocity and acceleration with the prescribed ones put in."""
+        one = jnp.ones_like(jnp.asarray(t))
+        v, a = jax.jvp(lambda t: self._position_and_velocity(t, velocity.dtype)[1], (t,), (one,))
+        return self._put(velocity, v), self._put(acceleration, a)
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        position, velocity = self.constrain(t, state.position, state.velocity)
+        return dataclasses.replace(state, position=position, velocity=velocity)
+
+    def _position_and_velocity(self, t: Any, dtype: Any) -> tuple[Array, Array]:
+        t = jnp.asarray(t)
+        p, v = jax.jvp(self.path, (t,), (jnp.ones_like(t),))
+        return p.astype(dtype), v.astype(dtype)
+
+    def _put(self, x: Array, values: Array) -> Array:
+        return x.at[jnp.array(self.particles, int)].set(values)
+
+    def check(self, particles: int, dim: int) -> None:
+        indices = self.particles
+        if len(set(indices)) < len(indices) or not all(0 <= k < particles for k in indices):
+            raise ValueError(
+                f"PrescribedMotion.particles must be different indices from 0 to {particles - 1}, got {list(indices)}"
+            )
+        shape = jax.eval_shape(self.path, jnp.zeros(())).shape
+        if shape != (len(indices), dim):
+            raise ValueError(
+                f"PrescribedMotion.path(t) must have shape ({len(indices)}, {dim}), (prescribed, dim), got {shape}"
+            )

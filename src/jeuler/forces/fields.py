@@ -1,0 +1,57 @@
+"""Force fields that act on every particle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from jeuler import _tree
+
+
+def per_particle(x: Array) -> Array:
+    """A parameter of shape () or (particle,), ready to multiply (particle, dim)."""
+    return x[:, None] if x.ndim else x
+
+
+@_tree.component()
+class Gravity:
+    """A uniform field.
+
+        F_i = m_i g
+
+    A pinned particle (mass = inf) feels none, so that no inf reaches the sum of forces.
+
+    Args:
+      acceleration: g, shape (dim,), m/s^2. Differentiable.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+    Raises: ValueError, in `simulate`, if its dim is not that of the positions.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> jeuler.Gravity([0.0, -9.81])(0.0, jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.asarray(2.0)).tolist()
+      [[0.0, -19.6200008392334]]
+    Source: I. Newton, Philosophiae naturalis principia mathematica, 1687.
+    """
+
+    acceleration: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "acceleration")
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        weight = jnp.where(jnp.isfinite(mass), mass, 0)
+        force = per_particle(weight) * self.acceleration.astype(position.dtype)
+        return jnp.broadcast_to(force, position.shape)
+
+    def energy(self, t: Any, position: Array, mass: Array) -> Array:
+        """Potential energy -sum_i m_i g.p_i, J."""
+        weight = jnp.where(jnp.isfinite(mass), mass, 0)
+        return -jnp.sum(weight * (position @ self.acceleration.astype(position.dtype)))
+
+    def check(self, particles: int, dim: int) -> None:
+        if self.acceleration.shape != (dim,):
+            raise ValueError(
+                f"Gravity.acceleration must have shape ({dim},), one component for each of position's, "
+                f"got {self.acceleration.shape}"
+            )

@@ -1,0 +1,81 @@
+"""Which particles are joined: a static graph, and the two linear maps between particles and springs."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+
+class Topology:
+    """The edges of a scene, fixed while tracing: hashable and equal by content, read as an integer array.
+
+    The signed incidence operator B takes a value at each particle to its difference along each edge,
+    (B x)_e = x_i - x_j for e = (i, j). Its transpose sums what each edge gives to its two ends, +f at i and -f at j.
+    """
+
+    def __init__(self, edges: Any) -> None:
+        if isinstance(edges, Topology):
+            edges = edges.edges
+        edges = np.asarray(edges)
+        if edges.size == 0:
+            edges = np.zeros((0, 2), np.int32)
+        if edges.ndim != 2 or edges.shape[1] != 2:
+            raise ValueError(f"edges must have shape (spring, 2), got {edges.shape}")
+        if not np.issubdtype(edges.dtype, np.integer):
+            raise ValueError(f"edges must be integers, particle indices, got {edges.dtype}")
+        loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
+        if loops.size:
+            raise ValueError(
+                f"edges must join two different particles, got edges[{loops[0]}] = {edges[loops[0]].tolist()}"
+            )
+        if edges.min(initial=0) < 0:
+            where = int(np.argmin(edges.min(axis=1)))
+            raise ValueError(f"edges must be particle indices from 0, got edges[{where}] = {edges[where].tolist()}")
+        self.edges = np.array(edges, dtype=np.int32)
+        self.edges.setflags(write=False)
+        self._key = (len(self.edges), hashlib.sha1(self.edges.tobytes()).hexdigest())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Topology) and self._key == other._key
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.edges, dtype=dtype)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.edges[index]
+
+    def __len__(self) -> int:
+        return len(self.edges)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.edges.shape
+
+    def __repr__(self) -> str:
+        return f"Topology({len(self)} edges)"
+
+    def check(self, particles: int) -> None:
+        """Every edge joins particles that exist."""
+        out_of_range = np.flatnonzero((self.edges >= particles).any(axis=1))
+        if out_of_range.size:
+            first = out_of_range[0]
+            raise ValueError(
+                f"edges must be indices below the number of particles, {particles}, "
+                f"got edges[{first}] = {self.edges[first].tolist()}"
+            )
+
+    def difference(self, x: Array) -> Array:
+        """B x: (particle, dim) to (spring, dim)."""
+        return x[self.edges[:, 0]] - x[self.edges[:, 1]]
+
+    def accumulate(self, force: Array, particles: int) -> Array:
+        """B^T f: (spring, dim) to (particle, dim)."""
+        total = jnp.zeros((particles, *force.shape[1:]), force.dtype)
+        return total.at[self.edges[:, 0]].add(force).at[self.edges[:, 1]].add(-force)
