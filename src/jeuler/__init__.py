@@ -1,6 +1,7 @@
 """jeuler: differentiable Euler integration of springs, particles and ODEs in JAX."""
 
 from jeuler.effects import PrescribedMotion, SampledPath
+from jeuler.fitting import Fit, SpringFit, fit, fit_springs
 from jeuler.forces import Gravity, QuadraticDrag, Springs
 from jeuler.methods import euler_step, heun_step, rk4_step, symplectic_euler_step
 from jeuler.particles import ParticleState, Scene, simulate
@@ -9,6 +10,7 @@ from jeuler.solve import Solution, solve
 __version__ = "0.1.0"
 
 __all__ = [
+    "Fit",
     "Gravity",
     "ParticleState",
     "PrescribedMotion",
@@ -16,8 +18,11 @@ __all__ = [
     "SampledPath",
     "Scene",
     "Solution",
+    "SpringFit",
     "Springs",
     "euler_step",
+    "fit",
+    "fit_springs",
     "heun_step",
     "rk4_step",
     "simulate",

@@ -58,8 +58,9 @@ def euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
     Raises: nothing of its own; `solve` checks its inputs once.
     Example:
       >>> import jeuler
-      >>> float(jeuler.euler_step(lambda x, y, args: x + y / 5, 0.0, -3.0, 1.0, None))
+      >>> round(float(jeuler.euler_step(lambda x, y, args: x + y / 5, 0.0, -3.0, 1.0, None)), 4)
       -3.6
+
     Source: L. Euler, Institutionum calculi integralis I, 1768, sect. 650.
     """
     return _tree.scale(dt, f(t, y, args))
@@ -88,6 +89,7 @@ def symplectic_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any)
       >>> x, v = jeuler.symplectic_euler_step(lambda t, y, args: (y[1], -y[0]), 0.0, (1.0, 0.0), 0.5, None)
       >>> float(x), float(v)
       (0.75, -0.5)
+
     Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2006, eq. I.1.9.
     """
     children, pair = jax.tree.flatten(y, is_leaf=lambda part: part is not y)
@@ -166,6 +168,7 @@ def heun_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
       >>> import jeuler
       >>> float(jeuler.heun_step(lambda t, y, args: y, 0.0, 1.0, 1.0, None))
       2.5
+
     Source: K. Heun, Neue Methoden zur approximativen Integration, Z. Math. Phys. 45, 1900.
     """
     return runge_kutta_increment(HEUN, f, t, y, dt, args)
@@ -189,6 +192,7 @@ def rk4_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
       >>> import jeuler
       >>> round(float(jeuler.rk4_step(lambda t, y, args: y, 0.0, 1.0, 1.0, None)), 4)
       2.7083
+
     Source: W. Kutta, Beitrag zur naeherungsweisen Integration totaler Differentialgleichungen, 1901.
     """
     return runge_kutta_increment(RK4, f, t, y, dt, args)

@@ -31,6 +31,7 @@ class ParticleState:
       >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.zeros((3, 2)), mass=[jnp.inf, 1.0, 1.0])
       >>> state.position.shape, state.mass.tolist()
       ((3, 2), [inf, 1.0, 1.0])
+
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 2.
     """
 
@@ -94,6 +95,7 @@ class Scene:
       >>> scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks=10.0, kd=0.1, rest_length=1.0),))
       >>> jax.tree.map(lambda leaf: 2 * leaf, scene).forces[0].ks.item()
       20.0
+
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 3.
     """
 
@@ -202,6 +204,7 @@ def simulate(
       >>> state = jeuler.ParticleState(jnp.zeros((1, 2)), jnp.array([[1.0, 0.0]]))
       >>> jeuler.simulate(scene, state, dt=0.5, num_steps=2).y.position[:, 0].tolist()
       [[0.0, 0.0], [0.5, 0.0], [1.0, -2.5]]
+
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
     state.check()

@@ -77,6 +77,7 @@ def solve(
       >>> solution = jeuler.solve(lambda x, y, args: x + y / 5, -3.0, dt=1.0, num_steps=5)
       >>> [round(float(y), 4) for y in solution.y]
       [-3.0, -3.6, -3.32, -1.984, 0.6192, 4.743]
+
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.1; compensated
       sums: A. Neumaier, Rundungsfehleranalyse einiger Verfahren zur Summation endlicher Summen, 1974.
     """

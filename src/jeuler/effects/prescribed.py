@@ -30,6 +30,7 @@ class SampledPath:
       >>> path = jeuler.SampledPath([0.0, 1.0, 2.0], [[0.0, 0.0], [1.0, 1.0], [2.0, 4.0]])
       >>> path(1.5).tolist()
       [1.5, 2.25]
+
     Source: C. de Boor, A Practical Guide to Splines, 1978, ch. IV (cubic Hermite interpolation).
     """
 
@@ -72,6 +73,7 @@ class PrescribedMotion:
       >>> end = jeuler.simulate(jeuler.Scene(effects=(hand,)), state, dt=0.5, num_steps=2)
       >>> round(float(end.y.position[-1, 0, 0]), 5), round(float(end.y.velocity[-1, 0, 0]), 5)
       (0.84147, 0.5403)
+
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 4 (user interaction).
     """
 

@@ -26,6 +26,7 @@ class QuadraticDrag:
       >>> import jax.numpy as jnp, jeuler
       >>> jeuler.QuadraticDrag(0.5)(0.0, jnp.zeros((1, 2)), jnp.array([[3.0, 4.0]]), jnp.asarray(1.0)).tolist()
       [[-7.5, -10.0]]
+
     Source: Lord Rayleigh, On the resistance of fluids, 1876.
     """
 

@@ -31,6 +31,7 @@ class Gravity:
       >>> import jax.numpy as jnp, jeuler
       >>> jeuler.Gravity([0.0, -9.81])(0.0, jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.asarray(2.0)).tolist()
       [[0.0, -19.6200008392334]]
+
     Source: I. Newton, Philosophiae naturalis principia mathematica, 1687.
     """
 

@@ -57,6 +57,7 @@ class Springs:
       >>> spring = jeuler.Springs([[0, 1]], ks=10.0, kd=0.0, rest_length=1.0)
       >>> spring(0.0, jnp.array([[0.0], [1.5]]), jnp.zeros((2, 1)), jnp.asarray(1.0)).tolist()
       [[5.0], [-5.0]]
+
     Source: D. Baraff, A. Witkin, Physically Based Modeling, SIGGRAPH course notes, 2001, particle systems, sect. 3.
     """
 

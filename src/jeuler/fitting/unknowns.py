@@ -1,0 +1,83 @@
+"""Parameters as the optimiser sees them: one vector, logarithms where they must stay positive."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.flatten_util import ravel_pytree
+
+from jeuler import _check
+
+PyTree = Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Unknowns:
+    """The change of variables between parameters p and the vector z.
+
+        p = exp(z) where positive,   p = scale z elsewhere
+
+    A step of one in z is then a large but sensible step in every parameter, whatever its unit.
+    """
+
+    start: Array
+    names: tuple[str, ...]
+    is_log: np.ndarray
+    scale: np.ndarray
+    unravel: Callable[[Array], PyTree]
+
+    @classmethod
+    def of(cls, params: PyTree, positive: PyTree, scale: PyTree = None) -> Unknowns:
+        """From starting values; ``positive`` and ``scale`` are trees of the structure of params or a prefix of it."""
+        params = _check.state("params", params)
+        leaves = jax.tree_util.tree_leaves_with_path(params)
+        names = tuple(
+            jax.tree_util.keystr(path) + ("" if not x.ndim else str(list(map(int, np.unravel_index(k, x.shape)))))
+            for path, x in leaves
+            for k in range(x.size)
+        )
+        p, unravel = ravel_pytree(params)
+        values = np.asarray(p)
+        is_log = np.asarray(_spread("positive", positive, params, np.bool_))
+        natural = np.where(values != 0, np.abs(values), 1.0)
+        sizes = natural if scale is None else np.asarray(_spread("scale", scale, params, values.dtype))
+        wrong = np.flatnonzero(~np.isfinite(values) | (is_log & ~(values > 0)))
+        if wrong.size:
+            k = int(wrong[0])
+            expected = "finite" if not np.isfinite(values[k]) else "greater than 0 (it is fitted as a logarithm)"
+            raise ValueError(
+                f"the start of params{names[k]} must be {expected}, got {values[k]}; start it at a positive guess"
+            )
+        start = np.where(is_log, np.log(np.where(is_log, values, 1.0)), values / sizes)
+        return cls(jnp.asarray(start, p.dtype), names, is_log, sizes.astype(values.dtype), unravel)
+
+    def params(self, z: Array) -> PyTree:
+        """The parameters at z."""
+        return self.unravel(jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, z, 0)), self.scale * z))
+
+    def slope(self, z: Array) -> np.ndarray:
+        """dp/dz, elementwise."""
+        z = np.asarray(z)
+        return np.where(self.is_log, np.exp(np.where(self.is_log, z, 0)), self.scale)
+
+
+def _spread(name: str, prefix: PyTree, params: PyTree, dtype: Any) -> np.ndarray:
+    """A prefix tree of params, one value for each of its numbers."""
+    try:
+        full = jax.tree.map(lambda value, part: jax.tree.map(lambda _: value, part), prefix, params)
+    except (ValueError, TypeError):
+        raise ValueError(
+            f"{name} must be one value or a tree that params extends, got {prefix!r} "
+            f"for params {jax.tree.structure(params)}"
+        ) from None
+    parts = [
+        np.broadcast_to(np.asarray(value, dtype), np.shape(x)).ravel()
+        for value, x in zip(jax.tree.leaves(full), jax.tree.leaves(params), strict=True)
+    ]
+    return np.concatenate(parts) if parts else np.zeros(0, dtype)
