@@ -6,6 +6,7 @@ from jeuler.forces import Gravity, QuadraticDrag, Springs
 from jeuler.methods import euler_step, heun_step, rk4_step, symplectic_euler_step
 from jeuler.particles import ParticleState, Scene, simulate
 from jeuler.solve import Solution, solve
+from jeuler.trajectory import Trajectory, read_trajectory
 
 __version__ = "0.1.0"
 
@@ -20,10 +21,12 @@ __all__ = [
     "Solution",
     "SpringFit",
     "Springs",
+    "Trajectory",
     "euler_step",
     "fit",
     "fit_springs",
     "heun_step",
+    "read_trajectory",
     "rk4_step",
     "simulate",
     "solve",

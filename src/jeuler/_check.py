@@ -81,7 +81,8 @@ def state(name: str, y: Any) -> Any:
 
 def same_form(what: str, y: Any, dy: Any) -> None:
     """dy (shapes and dtypes are enough) has the structure and shapes of y and does not widen its dtypes."""
-    expected, came = jax.tree.structure(y), jax.tree.structure(dy)
+    expected: Any = jax.tree.structure(y)
+    came: Any = jax.tree.structure(dy)
     if expected != came:
         raise ValueError(f"{what} must return the structure of the state, {expected}, got {came}")
     came_leaves = jax.tree.leaves(dy)

@@ -99,7 +99,8 @@ def symplectic_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any)
             f"write the system as a pair, or use euler_step"
         )
     _, velocity = children
-    _, acceleration = pair.flatten_up_to(f(t, y, args))
+    slope = f(t, y, args)
+    _, acceleration = jax.tree.leaves(slope, is_leaf=lambda part: part is not slope)
     velocity_increment = _tree.scale(dt, acceleration)
     position_increment = _tree.scale(dt, _tree.add(velocity, velocity_increment))
     return jax.tree.unflatten(pair, (position_increment, velocity_increment))

@@ -35,9 +35,9 @@ class ParticleState:
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 2.
     """
 
-    position: Array
-    velocity: Array
-    mass: Array = 1.0  # type: ignore[assignment]
+    position: _tree.Parameter
+    velocity: _tree.Parameter
+    mass: _tree.Parameter = 1.0
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -73,7 +73,8 @@ class ParticleState:
             bad = np.flatnonzero(~(mass > 0))
             if bad.size:
                 raise ValueError(
-                    f"state.mass must be greater than 0 kg (inf pins a particle), got {mass[bad[0]]} at particle {bad[0]}"
+                    f"state.mass must be greater than 0 kg (inf pins a particle), "
+                    f"got {mass[bad[0]]} at particle {bad[0]}"
                 )
 
 
@@ -220,7 +221,7 @@ def simulate(
         state, lost = state_and_lost
         motion = state.position, state.velocity
         (position, velocity), lost = advance(field, t, (motion, lost), grid.dt, state.mass)
-        state = dataclasses.replace(state, position=position, velocity=velocity)
+        state = _tree.replace(state, position=position, velocity=velocity)
         for index, effect in enumerate(scene.effects):
             own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, n), index)
             state = effect(grid.clock(n + 1), grid.dt, state, own_key)
@@ -237,4 +238,4 @@ def _at_start(scene: Scene, state: ParticleState, t0: Array) -> ParticleState:
     position = jax.lax.convert_element_type(state.position, dtype)
     velocity = jnp.where(per_particle(jnp.isinf(mass)), 0, jax.lax.convert_element_type(state.velocity, dtype))
     position, velocity = scene.constrain(t0, position, velocity)
-    return dataclasses.replace(state, position=position, velocity=velocity, mass=mass)
+    return _tree.replace(state, position=position, velocity=velocity, mass=mass)

@@ -63,7 +63,7 @@ def solve(
       num_steps: number of steps, an integer >= 0.
       t0: initial time, s. Differentiable.
       args: passed to f; any pytree. Differentiable.
-      step: the method: `euler_step`, `symplectic_euler_step`, `heun_step`, `rk4_step` or any function of that signature.
+      step: the method: `euler_step`, `symplectic_euler_step`, `heun_step`, `rk4_step` or any such function.
       save_every: save each save_every-th step; must divide num_steps.
       save: ``save(t, y)`` makes what is kept of a saved state; None keeps y.
       checkpoint: reverse mode keeps every state (None), or only one in ``checkpoint`` steps and computes the others

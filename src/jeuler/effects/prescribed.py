@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -34,8 +33,8 @@ class SampledPath:
     Source: C. de Boor, A Practical Guide to Splines, 1978, ch. IV (cubic Hermite interpolation).
     """
 
-    times: Array
-    positions: Array
+    times: _tree.Parameter
+    positions: _tree.Parameter
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "times", "positions")
@@ -77,7 +76,7 @@ class PrescribedMotion:
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 4 (user interaction).
     """
 
-    particles: tuple[int, ...]
+    particles: Any
     path: Any
 
     def __post_init__(self) -> None:
@@ -98,7 +97,7 @@ class PrescribedMotion:
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         position, velocity = self.constrain(t, state.position, state.velocity)
-        return dataclasses.replace(state, position=position, velocity=velocity)
+        return _tree.replace(state, position=position, velocity=velocity)
 
     def _position_and_velocity(self, t: Any, dtype: Any) -> tuple[Array, Array]:
         t = jnp.asarray(t)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -122,19 +123,21 @@ def fit(
             last = stage == len(weights)
             if last and not np.isfinite(problem.evaluate(z, weight)[0]) and np.isfinite(seen.best_loss):
                 z = seen.best
-            kwargs = {"max_iterations": max_iterations, "tolerance": tolerance}
-            if not last:
-                kwargs = {"max_iterations": min(max_iterations, 10), "tolerance": 1e-3}
-            if optimizer is None:
-                z, converged = levenberg_marquardt(problem, z, weight, seen, **kwargs)
-            else:
-                z, converged = descend(problem, optimizer, z, weight, seen, **kwargs)
+            descent = levenberg_marquardt if optimizer is None else functools.partial(descend, optimizer)
+            z, converged = descent(
+                problem,
+                z,
+                weight,
+                seen,
+                max_iterations=max_iterations if last or optimizer is not None else min(max_iterations, 10),
+                tolerance=tolerance if last else 1e-3,
+            )
     if not np.isfinite(seen.best_loss):
         raise ValueError(
             "the residual is not finite at the start of the fit, nor at any point that was tried; "
             "start closer, or use a smaller dt or a stabler step"
         )
-    return _report(unknowns, problem, flat_residual, seen, converged, fits_in_memory)
+    return _report(unknowns, problem, everything, seen, converged, fits_in_memory)
 
 
 @contextlib.contextmanager
@@ -148,7 +151,7 @@ def _bar(progress: bool | None, total: int):
 def _report(
     unknowns: Unknowns,
     problem: LeastSquares,
-    residual: Callable[[Array], Array],
+    everything: Array,
     seen: Progress,
     converged: bool,
     fits_in_memory: bool,
@@ -157,9 +160,9 @@ def _report(
     stderr = matrix = None
     undetermined: tuple[str, ...] = ()
     if fits_in_memory:
-        jacobian = np.asarray(problem.jacobian(z))
+        r, jacobian = (np.asarray(x) for x in problem.linearise(z, everything)[:2])
         if np.isfinite(jacobian).all():
-            variances, silent = covariance(jacobian, np.asarray(residual(z)))
+            variances, silent = covariance(jacobian, r)
             slope = unknowns.slope(z)
             with np.errstate(invalid="ignore"):
                 matrix = np.where(variances == 0, 0, variances * np.outer(slope, slope))

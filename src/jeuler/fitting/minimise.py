@@ -21,19 +21,19 @@ class Progress:
     """What a fit has seen so far."""
 
     bar: Any
-    best: Array
+    best: Any
     best_loss: float
     history: list[float] = dataclasses.field(default_factory=list)
     nonfinite: int = 0
 
-    def see(self, z: Array, loss: float) -> None:
+    def see(self, z: Any, loss: float) -> None:
         """One iteration's end: its point and its loss over all the data."""
         self.history.append(loss if np.isfinite(loss) else np.inf)
         self.offer(z, loss)
         self.bar.update()
         self.bar.set_postfix_str(f"loss {loss:.4g}, best {self.best_loss:.4g}", refresh=False)
 
-    def offer(self, z: Array, loss: float) -> None:
+    def offer(self, z: Any, loss: float) -> None:
         if np.isfinite(loss) and not loss >= self.best_loss:
             self.best, self.best_loss = z, loss
 
@@ -47,18 +47,19 @@ class LeastSquares:
     def __init__(self, residual: Callable[[Array], Array], size: int) -> None:
         self.size = size
         self.evaluate = jax.jit(lambda z, w: self._losses(residual(z), w))
-        self.value_and_grad = jax.jit(jax.value_and_grad(lambda z, w: self._losses(residual(z), w)[0]))
+        self.value_and_grad = jax.jit(jax.value_and_grad(lambda z, w: self._losses(residual(z), w), has_aux=True))
         self.objective = lambda z, w: self._losses(residual(z), w)[0]
 
-        def jacobian(z: Array) -> Array:
+        def linearise(z: Array, w: Array) -> tuple[Array, Array, Array, Array]:
             def column(direction):
-                return jax.jvp(residual, (z,), (direction,))[1]
+                return jax.jvp(residual, (z,), (direction,))
 
-            columns = jax.lax.map(column, jnp.eye(len(z), dtype=z.dtype), batch_size=JACOBIAN_COLUMNS_AT_ONCE)
-            return columns.T
+            directions = jnp.eye(len(z), dtype=z.dtype)
+            values, columns = jax.lax.map(column, directions, batch_size=JACOBIAN_COLUMNS_AT_ONCE)
+            r, jacobian = values[0], columns.T
+            return r, jacobian, *self._normal_equations(r, jacobian, w)
 
-        self.jacobian = jax.jit(jacobian)
-        self.linearise = jax.jit(lambda z, w: self._normal_equations(residual(z), jacobian(z), w))
+        self.linearise = jax.jit(linearise)  # r, J, J^T J and J^T r of what counts
 
     def _losses(self, r: Array, w: Array) -> tuple[Array, Array]:
         """The mean square of what counts now, and of everything."""
@@ -76,14 +77,14 @@ class LeastSquares:
 
 def levenberg_marquardt(
     problem: LeastSquares,
-    z: Array,
+    z: Any,
     weight: Array,
     progress: Progress,
     *,
     max_iterations: int,
     tolerance: float,
     longest_step: float = 1.0,
-) -> tuple[Array, bool]:
+) -> tuple[Any, bool]:
     """Descend by damped Gauss-Newton steps (J^T J + damping I) s = -J^T r, the damping ruled by the gain ratio.
 
     The damping is one number for all unknowns, in the units of `Unknowns`: what the data do not determine stays at
@@ -92,13 +93,14 @@ def levenberg_marquardt(
     Returns the last accepted point, and whether it converged: the relative decrease fell below the tolerance.
     Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, sect. 3.2.
     """
+    z = np.asarray(z)
     loss, total = (float(x) for x in problem.evaluate(z, weight))
     progress.offer(z, total)
     if not np.isfinite(loss):
         progress.nonfinite += 1
         return z, False
-    matrix, gradient = problem.linearise(z, weight)
-    damping = 1e-3 * float(jnp.max(jnp.diag(matrix)))
+    matrix, gradient = _normal_equations(problem, z, weight)
+    damping = 1e-3 * float(np.max(np.diag(matrix)))
     growth = 2.0
     for _ in range(max_iterations):
         if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
@@ -110,8 +112,8 @@ def levenberg_marquardt(
         length = float(np.max(np.abs(step)))
         if length > longest_step:
             step = step * (longest_step / length)
-        trial = z + jnp.asarray(step, z.dtype)
-        predicted = -float(step @ (2 * np.asarray(gradient, float) + np.asarray(matrix, float) @ step))
+        trial = (z + step).astype(z.dtype)
+        predicted = -float(step @ (2 * gradient + matrix @ step))
         trial_loss, trial_total = (float(x) for x in problem.evaluate(trial, weight))
         progress.nonfinite += not np.isfinite(trial_loss)
         if trial_loss < loss:
@@ -122,32 +124,38 @@ def levenberg_marquardt(
             progress.see(z, trial_total)
             if converged:
                 return z, True
-            matrix, gradient = problem.linearise(z, weight)
+            matrix, gradient = _normal_equations(problem, z, weight)
         else:
             damping, growth = damping * growth, growth * 2
-            if predicted <= tolerance * loss or length <= 4 * float(jnp.finfo(z.dtype).eps):
+            if predicted <= tolerance * loss or length <= 4 * float(np.finfo(z.dtype).eps):
                 return z, True
     return z, False
 
 
-def _damped_step(matrix: Array, gradient: Array, damping: float) -> np.ndarray:
-    """The solution of (J^T J + damping I) s = -J^T r, in float64, by the eigenvectors of the symmetric matrix."""
-    values, vectors = np.linalg.eigh(np.asarray(matrix, float))
+def _normal_equations(problem: LeastSquares, z: np.ndarray, weight: Array) -> tuple[np.ndarray, np.ndarray]:
+    """J^T J and J^T r in float64."""
+    _, _, matrix, gradient = problem.linearise(z, weight)
+    return np.asarray(matrix, float), np.asarray(gradient, float)
+
+
+def _damped_step(matrix: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
+    """The solution of (J^T J + damping I) s = -J^T r, by the eigenvectors of the symmetric matrix."""
+    values, vectors = np.linalg.eigh(matrix)
     values = np.maximum(values, 0) + max(damping, 1e-15 * values[-1])
-    return -vectors @ ((vectors.T @ np.asarray(gradient, float)) / values)
+    return -vectors @ ((vectors.T @ gradient) / values)
 
 
 def descend(
-    problem: LeastSquares,
     optimizer: Any,
-    z: Array,
+    problem: LeastSquares,
+    z: Any,
     weight: Array,
     progress: Progress,
     *,
     max_iterations: int,
     tolerance: float,
     patience: int = 50,
-) -> tuple[Array, bool]:
+) -> tuple[Any, bool]:
     """Descend by an optax optimiser. A step into non-finite values goes back to the best point and halves what follows.
 
     Returns the last finite point, and whether it converged: no relative decrease above the tolerance in ``patience``
@@ -167,14 +175,14 @@ def descend(
     state, damping = optimizer.init(z), 1.0
     best, best_loss, since_best = z, np.inf, 0
     for _ in range(max_iterations):
-        loss, gradient = problem.value_and_grad(z, weight)
+        (loss, total), gradient = problem.value_and_grad(z, weight)
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
             progress.nonfinite += 1
             if not np.isfinite(best_loss):
                 return z, False
             z, state, damping = best, optimizer.init(best), damping / 2
             continue
-        progress.see(z, float(problem.evaluate(z, weight)[1]))
+        progress.see(z, float(total))
         since_best = 0 if loss < (1 - tolerance) * best_loss else since_best + 1
         if loss < best_loss:
             best, best_loss = z, float(loss)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import re
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _check
+from jeuler import _check, _tree
 from jeuler._interpolate import hermite
 from jeuler.fitting.fit import fit
 from jeuler.methods import Step, rk4_step
@@ -85,9 +85,10 @@ def fit_springs(
       positions: what was measured, (time, particle, dim), m; NaN = not observed.
       dt: step size of the simulation, s.
       parameters: what is free: any of "ks", "kd", "rest_length" (or another parameter of the scene's forces, such as
-        "coefficient" of a drag), "mass" (of the particles that can move), "velocity", "position" (their initial ones)
-        and "anchors" (positions of the pinned particles). Force parameters and masses are fitted as logarithms, so
-        they stay positive; vectors, such as gravity's "acceleration", are fitted as they are.
+        "coefficient" of a drag; "forces[1].ks" names that of one force among several), "mass" (of the particles that
+        can move), "velocity", "position" (their initial ones) and "anchors" (positions of the pinned particles).
+        Force parameters and masses are fitted as logarithms, so they stay positive; vectors, such as gravity's
+        "acceleration", are fitted as they are.
       t0: time of the state, s.
       num_steps: number of steps; None takes as many as reach the last time.
       step: the method, as in `solve`.
@@ -155,7 +156,7 @@ def fit_springs(
     result = fit(
         residual,
         start,
-        positive={name: _is_positive(name, part) for name, part in start.items()},
+        positive={name: _is_positive(name) for name in start},
         scale={name: _speed(times, targets) if name == "velocity" else amplitude for name in start},
         optimizer=optimizer,
         max_iterations=max_iterations,
@@ -239,44 +240,51 @@ def _free(state: ParticleState) -> np.ndarray:
     return np.broadcast_to(np.isfinite(np.asarray(state.mass)), state.position.shape[:1])
 
 
-def _has(force: Any, name: str) -> bool:
-    return dataclasses.is_dataclass(force) and any(field.name == name for field in dataclasses.fields(force))
+def _fields(force: Any) -> set[str]:
+    """The names of a force's parameters."""
+    if not dataclasses.is_dataclass(force):
+        return set()
+    return {field.name for field in dataclasses.fields(force)} - {"edges", "function"}
+
+
+def _owners(scene: Scene, name: str) -> tuple[list[int], str]:
+    """Which forces have the parameter "ks", or "forces[1].ks" for one of them, and its field's name."""
+    one = re.fullmatch(r"forces\[(\d+)\]\.(\w+)", name)
+    field = one.group(2) if one else name
+    owners = [k for k, force in enumerate(scene.forces) if field in _fields(force)]
+    return [k for k in owners if one is None or k == int(one.group(1))], field
 
 
 def _of_springs(scene: Scene, name: str) -> Any:
-    values = [getattr(force, name) for force in scene.forces if _has(force, name)]
-    return values[0] if len(values) == 1 else tuple(values)
+    owners, field = _owners(scene, name)
+    values = tuple(getattr(scene.forces[k], field) for k in owners)
+    return values[0] if len(values) == 1 else values
 
 
-def _is_positive(name: str, part: Any) -> bool:
-    return name not in ("velocity", "position", "anchors", "acceleration")
+def _is_positive(name: str) -> bool:
+    return name.rpartition(".")[2] not in ("velocity", "position", "anchors", "acceleration")
 
 
 def _read(scene: Scene, state: ParticleState, parameters: tuple[str, ...]) -> dict[str, Any]:
     """The starting values by name."""
     if isinstance(parameters, str) or not parameters:
         raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {parameters!r}')
-    free, state_dtype = _free(state), state.position.dtype
-    known = {field.name for force in scene.forces if dataclasses.is_dataclass(force) for field in dataclasses.fields(force)}
-    known -= {"edges", "function"}
+    free, dtype = _free(state), state.position.dtype
     start: dict[str, Any] = {}
     for name in parameters:
-        if name in known:
-            values = _of_springs(scene, name)
-            start[name] = jax.tree.map(lambda x: jnp.asarray(x, state_dtype), values)
-        elif name in STATE_PARAMETERS:
-            source = state.position if name in ("position", "anchors") else getattr(state, name)
-            if name == "mass" and not source.ndim:
-                start[name] = source
-                continue
-            which = ~free if name == "anchors" else free
-            if not which.any():
-                raise ValueError(f"parameters names {name!r}, but the state has no {'pinned' if name == 'anchors' else 'free'} particle")
-            start[name] = source[np.flatnonzero(which)]
+        if _owners(scene, name)[0]:
+            start[name] = jax.tree.map(lambda x: jnp.asarray(x, dtype), _of_springs(scene, name))
+        elif name not in STATE_PARAMETERS:
+            known = sorted(set().union(*(_fields(force) for force in scene.forces)))
+            raise ValueError(f"parameters must be among {(*known, *STATE_PARAMETERS)} for this scene, got {name!r}")
+        elif name == "mass" and not state.mass.ndim:
+            start[name] = state.mass
         else:
-            raise ValueError(
-                f"parameters must be among {(*sorted(known), *STATE_PARAMETERS)} for this scene, got {name!r}"
-            )
+            rows = np.flatnonzero(~free if name == "anchors" else free)
+            if not rows.size:
+                kind = "pinned (mass = inf)" if name == "anchors" else "free"
+                raise ValueError(f"parameters names {name!r}, but the state has no {kind} particle")
+            start[name] = getattr(state, "position" if name == "anchors" else name)[rows]
     return start
 
 
@@ -285,18 +293,13 @@ def _put(scene: Scene, state: ParticleState, params: dict[str, Any]) -> tuple[Sc
     free = _free(state)
     forces = list(scene.forces)
     for name, value in params.items():
-        if name not in STATE_PARAMETERS:
-            owners = [k for k, force in enumerate(forces) if _has(force, name)]
-            values = value if len(owners) > 1 else (value,)
-            for k, x in zip(owners, values, strict=True):
-                forces[k] = dataclasses.replace(forces[k], **{name: x})
-            continue
-        field = "position" if name == "anchors" else name
-        if name == "mass" and not value.ndim:
-            state = dataclasses.replace(state, mass=value)
-        else:
+        owners, field = _owners(scene, name)
+        for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
+            forces[k] = _tree.replace(forces[k], **{field: x})
+        if not owners and name == "mass" and not value.ndim:
+            state = _tree.replace(state, mass=value)
+        elif not owners:
+            field = "position" if name == "anchors" else name
             rows = np.flatnonzero(~free if name == "anchors" else free)
-            state = dataclasses.replace(state, **{field: getattr(state, field).at[rows].set(value)})
-    return dataclasses.replace(scene, forces=tuple(forces)), state
-
-
+            state = _tree.replace(state, **{field: getattr(state, field).at[rows].set(value)})
+    return _tree.replace(scene, forces=tuple(forces)), state

@@ -43,7 +43,7 @@ class Unknowns:
             for k in range(x.size)
         )
         p, unravel = ravel_pytree(params)
-        values = np.asarray(p)
+        values: np.ndarray = np.asarray(p)
         is_log = np.asarray(_spread("positive", positive, params, np.bool_))
         natural = np.where(values != 0, np.abs(values), 1.0)
         sizes = natural if scale is None else np.asarray(_spread("scale", scale, params, values.dtype))
@@ -63,8 +63,7 @@ class Unknowns:
 
     def slope(self, z: Array) -> np.ndarray:
         """dp/dz, elementwise."""
-        z = np.asarray(z)
-        return np.where(self.is_log, np.exp(np.where(self.is_log, z, 0)), self.scale)
+        return np.where(self.is_log, np.exp(np.where(self.is_log, np.asarray(z), 0)), self.scale)
 
 
 def _spread(name: str, prefix: PyTree, params: PyTree, dtype: Any) -> np.ndarray:

@@ -30,7 +30,7 @@ class QuadraticDrag:
     Source: Lord Rayleigh, On the resistance of fluids, 1876.
     """
 
-    coefficient: Array
+    coefficient: _tree.Parameter
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "coefficient")

@@ -35,7 +35,7 @@ class Gravity:
     Source: I. Newton, Philosophiae naturalis principia mathematica, 1687.
     """
 
-    acceleration: Array
+    acceleration: _tree.Parameter
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "acceleration")

@@ -61,10 +61,10 @@ class Springs:
     Source: D. Baraff, A. Witkin, Physically Based Modeling, SIGGRAPH course notes, 2001, particle systems, sect. 3.
     """
 
-    edges: Topology
-    ks: Array
-    kd: Array
-    rest_length: Array
+    edges: Any
+    ks: _tree.Parameter
+    kd: _tree.Parameter
+    rest_length: _tree.Parameter
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))

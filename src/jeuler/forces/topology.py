@@ -20,9 +20,7 @@ class Topology:
     def __init__(self, edges: Any) -> None:
         if isinstance(edges, Topology):
             edges = edges.edges
-        edges = np.asarray(edges)
-        if edges.size == 0:
-            edges = np.zeros((0, 2), np.int32)
+        edges = np.asarray(edges) if np.size(edges) else np.zeros((0, 2), np.int32)
         if edges.ndim != 2 or edges.shape[1] != 2:
             raise ValueError(f"edges must have shape (spring, 2), got {edges.shape}")
         if not np.issubdtype(edges.dtype, np.integer):
@@ -35,7 +33,7 @@ class Topology:
         if edges.min(initial=0) < 0:
             where = int(np.argmin(edges.min(axis=1)))
             raise ValueError(f"edges must be particle indices from 0, got edges[{where}] = {edges[where].tolist()}")
-        self.edges = np.array(edges, dtype=np.int32)
+        self.edges: np.ndarray = np.array(edges, dtype=np.int32)
         self.edges.setflags(write=False)
         self._key = (len(self.edges), hashlib.sha1(self.edges.tobytes()).hexdigest())
 
