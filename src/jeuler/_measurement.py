@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import os
 import re
 import time
 from typing import Any
@@ -250,7 +251,8 @@ def _report(
         for k, label in enumerate(labels)
     ]
     rms = float(np.sqrt(found.loss))
-    amplitude = float(np.nanmax(np.ptp(np.nan_to_num(_centred(measured.positions)), axis=0)) / 2)
+    away = measured.positions - np.nanmean(measured.positions, axis=0)
+    amplitude = float(np.nanmax(np.linalg.norm(away, axis=-1)))
     report: dict[str, Any] = {
         "source": measured.source,
         "samples": int(np.isfinite(measured.positions).sum()),
@@ -281,10 +283,6 @@ def _modes(found: SpringFit, pairs: list[tuple[int, int]]) -> list[Mode]:
     return modes(found.scene, _tree.replace(found.state, position=found.state.position * 0 + unmoved))
 
 
-def _centred(positions: np.ndarray) -> np.ndarray:
-    return positions - np.nanmean(positions, axis=0)
-
-
 def _parts(x: Any) -> tuple:
     return x if isinstance(x, tuple) else (x,)
 
@@ -304,9 +302,10 @@ def _draw(measured: Measurement, found: SpringFit, picture: str, dt: float, repo
     steps = int(np.ceil((measured.times[-1] - t0) / dt))
     run = jax.jit(lambda: simulate(found.scene, found.state, dt=dt, num_steps=steps, t0=t0, step=rk4_step))()
     spring = report["springs"][0]
-    title = f"{measured.source}: ks = {spring['ks']:.4g} N/m, kd = {spring['kd']:.3g} N s/m"
+    source = os.path.basename(measured.source)
+    title = f"{source}: ks = {spring['ks']:.4g} N/m, kd = {spring['kd']:.3g} N s/m"
     if len(report["springs"]) > 1:
-        title = f"{measured.source}: {len(report['springs'])} springs fitted"
+        title = f"{source}: {len(report['springs'])} springs fitted"
     figure = plot_fit(
         measured.times,
         measured.positions.reshape(count, -1),
@@ -337,8 +336,8 @@ def _print(report: dict[str, Any], picture: str, example: bool) -> None:
         hertz, squared = omega / (2 * np.pi), omega**2
         print(f"  {'natural frequency':<24} {omega:.5g} rad/s = {hertz:.4g} Hz (squared {squared:.4g} 1/s^2)")
         print(f"  {'damping ratio':<24} {mode['damping_ratio']:.4g}")
-    share = f", {100 * report['share_of_amplitude']:.2g} % of the amplitude" if report["amplitude"] else ""
-    print(f"  {'residual RMS':<24} {report['rms']:.3g} m{share} of {report['amplitude']:.3g} m")
+    share = f", {100 * report['share_of_amplitude']:.2g} % of the amplitude {report['amplitude']:.3g} m" if report["amplitude"] else ""
+    print(f"  {'residual RMS':<24} {report['rms']:.3g} m{share}")
     print(f"  {'fit':<24} {report['message']}, {report['iterations']} iterations")
     print(f"  {'time':<24} {report['seconds']:.1f} s in all")
     print(f"  {'picture':<24} {picture}")
