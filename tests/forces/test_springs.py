@@ -1,0 +1,106 @@
+"""The spring and damper law, and its hardest point: coincident ends."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+
+
+def by_the_formula(p, v, edges, ks, kd, rest_length):
+    """A transcription of the law, spring by spring, in NumPy."""
+    force = np.zeros_like(p)
+    for (i, j), k, c, length in zip(edges, ks, kd, rest_length, strict=True):
+        d = p[i] - p[j]
+        r = np.linalg.norm(d)
+        u = d / r
+        pull = k * (length - r) * u - c * np.dot(v[i] - v[j], u) * u
+        force[i] += pull
+        force[j] -= pull
+    return force
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_law(random, dim):
+    p, v = random.normal(size=(2, 12, dim))
+    edges = np.array([(i, j) for i in range(12) for j in range(i) if random.random() < 0.4])
+    ks, kd, rest_length = random.uniform(0.5, 3, (3, len(edges)))
+    ours = jeuler.Springs(edges, ks, kd, rest_length)(0.0, jnp.asarray(p), jnp.asarray(v), jnp.ones(()))
+    np.testing.assert_allclose(ours, by_the_formula(p, v, edges, ks, kd, rest_length), rtol=1e-11, atol=1e-12)
+
+
+def force_on_first(d, ks=2.0, kd=0.5, rest_length=0.0):
+    position = jnp.stack([d, jnp.zeros_like(d)])
+    velocity = jnp.ones_like(position) * jnp.array([[1.0], [-1.0]], d.dtype)
+    return jeuler.Springs([[0, 1]], ks, kd, rest_length)(0.0, position, velocity, jnp.ones((), d.dtype))[0]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_coincident_ends_without_length(dtype):
+    """The force is 0, the Jacobian exactly -ks I, the second derivative 0."""
+    zero = jnp.zeros(3, dtype)
+    assert force_on_first(zero).tolist() == [0, 0, 0]
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_array_equal(jacobian(force_on_first)(zero), -2 * np.eye(3))
+    np.testing.assert_array_equal(jax.hessian(lambda d: force_on_first(d) @ jnp.ones(3, dtype))(zero), 0)
+    np.testing.assert_array_equal(jax.vmap(jax.jacfwd(force_on_first))(jnp.zeros((2, 3), dtype))[1], -2 * np.eye(3))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-20, 1e-14, 1e-10, 1e-5])
+@pytest.mark.parametrize("rest_length", [0.0, 1.0])
+def test_nearly_coincident_ends_are_finite_to_second_order(dtype, size, rest_length):
+    d = jnp.asarray([size, 0.0, size], dtype)
+
+    def total(d):
+        return jnp.sum(force_on_first(d, rest_length=rest_length))
+
+    for value in (total(d), jax.grad(total)(d), jax.hessian(total)(d)):
+        assert np.isfinite(value).all()
+
+
+def test_one_coincident_pair_among_many(random):
+    position = jnp.asarray(random.normal(size=(6, 2))).at[3].set(0.7).at[4].set(0.7)
+    edges = [(k, k + 1) for k in range(5)]
+    scene = jeuler.Scene(forces=(jeuler.Springs(edges, 10.0, 0.1, 0.5),))
+    state = jeuler.ParticleState(position, jnp.zeros((6, 2)))
+
+    def loss(scene):
+        return jnp.sum(jeuler.simulate(scene, state, dt=0.01, num_steps=20).y.position ** 2)
+
+    slope = jax.grad(loss)(scene)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    batch = jax.vmap(jax.grad(lambda k: loss(jax.tree.map(lambda x: k * x, scene))))(jnp.array([1.0, 2.0]))
+    assert np.isfinite(batch).all()
+
+
+def test_large_coordinates_lose_no_digits():
+    """Two particles a metre apart, a thousand kilometres away, in float32: the offset is exact there."""
+    near = jnp.array([[0.0, 0.0], [1.25, 0.0]], jnp.float32)
+    spring = jeuler.Springs([[0, 1]], 100.0, 0.0, 1.0)
+    still = jnp.zeros((2, 2), jnp.float32)
+    here = spring(0.0, near, still, jnp.float32(1))
+    there = spring(0.0, near + jnp.float32(2**20), still, jnp.float32(1))
+    np.testing.assert_array_equal(here, there)
+
+
+def test_topology_reads_as_an_array():
+    springs = jeuler.Springs(np.array([[0, 1], [2, 1]]), 1.0, 0.0, 1.0)
+    assert np.asarray(springs.edges).tolist() == [[0, 1], [2, 1]]
+    assert springs.edges.shape == (2, 2)
+    assert springs.edges[:, 0].tolist() == [0, 2]
+    assert hash(springs.edges) == hash(jeuler.Springs([[0, 1], [2, 1]], 2.0, 0.0, 1.0).edges)
+    assert springs.edges != jeuler.Springs([[0, 1], [1, 2]], 2.0, 0.0, 1.0).edges
+
+
+def test_oscillation_against_the_exact_solution():
+    """A mass on a damped spring, against x = e^(-gt) (cos wt + g/w sin wt)."""
+    ks, kd, mass = 9.0, 0.6, 1.5
+    scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks, kd, 1.0),))
+    state = jeuler.ParticleState([[0.0], [1.3]], [[0.0], [0.0]], mass=[jnp.inf, mass])
+    run = jeuler.simulate(scene, state, dt=1e-3, num_steps=4000, step=jeuler.rk4_step)
+    decay = kd / mass / 2
+    omega = np.sqrt(ks / mass - decay**2)
+    exact = 1 + 0.3 * np.exp(-decay * run.t) * (np.cos(omega * run.t) + decay / omega * np.sin(omega * run.t))
+    np.testing.assert_allclose(run.y.position[:, 1, 0], exact, atol=1e-11)
