@@ -33,9 +33,9 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, 
     inverse = (vectors[:, ~null] / values[~null]) @ vectors[:, ~null].T
     inverse /= np.outer(np.where(silent, 1, norms), np.where(silent, 1, norms))
     freedom = m - int(np.sum(~null))
-    variance = np.sum(residual**2) / freedom if freedom > 0 else np.inf
-    with np.errstate(invalid="ignore"):
-        result = inverse * variance
+    if freedom <= 0:  # as many unknowns as data: nothing is left over to tell the noise from
+        return np.diag(np.full(n, np.inf)), undetermined
+    result = inverse * np.sum(residual**2) / freedom
     result[undetermined, :] = 0
     result[:, undetermined] = 0
     result[undetermined, undetermined] = np.inf

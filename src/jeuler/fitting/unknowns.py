@@ -21,12 +21,13 @@ PyTree = Any
 class Unknowns:
     """The change of variables between parameters p and the vector z.
 
-        p = exp(z) where positive,   p = scale z elsewhere
+        p = p0 exp(z) where positive,   p = p0 + scale z elsewhere
 
-    A step of one in z is then a large but sensible step in every parameter, whatever its unit.
+    A step of one in z is then a large but sensible step in every parameter, whatever its unit, and z = 0 is the start
+    exactly.
     """
 
-    start: Array
+    origin: Array
     names: tuple[str, ...]
     is_log: np.ndarray
     scale: np.ndarray
@@ -54,16 +55,21 @@ class Unknowns:
             raise ValueError(
                 f"the start of params{names[k]} must be {expected}, got {values[k]}; start it at a positive guess"
             )
-        start = np.where(is_log, np.log(np.where(is_log, values, 1.0)), values / sizes)
-        return cls(jnp.asarray(start, p.dtype), names, is_log, sizes.astype(values.dtype), unravel)
+        return cls(p, names, is_log, sizes.astype(values.dtype), unravel)
+
+    @property
+    def start(self) -> Array:
+        """Where the search begins."""
+        return jnp.zeros_like(self.origin)
 
     def params(self, z: Array) -> PyTree:
         """The parameters at z."""
-        return self.unravel(jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, z, 0)), self.scale * z))
+        factor = jnp.exp(jnp.where(self.is_log, z, 0))
+        return self.unravel(jnp.where(self.is_log, self.origin * factor, self.origin + self.scale * z))
 
     def slope(self, z: Array) -> np.ndarray:
         """dp/dz, elementwise."""
-        return np.where(self.is_log, np.exp(np.where(self.is_log, np.asarray(z), 0)), self.scale)
+        return np.where(self.is_log, self.origin * np.exp(np.where(self.is_log, np.asarray(z), 0)), self.scale)
 
 
 def _spread(name: str, prefix: PyTree, params: PyTree, dtype: Any) -> np.ndarray:

@@ -1,0 +1,57 @@
+"""Completeness: every public name is documented, in the README, in the tables; importing stays light."""
+
+import inspect
+import pathlib
+import re
+import subprocess
+import sys
+
+import cases
+import pytest
+
+import jeuler
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+
+
+@pytest.mark.parametrize("name", jeuler.__all__)
+def test_public_name_has_a_full_docstring(name):
+    doc = inspect.getdoc(getattr(jeuler, name))
+    assert doc
+    assert doc.splitlines()[0].endswith((".", ":"))
+    if name in ("Solution", "Fit", "SpringFit", "Trajectory"):  # what functions give back: their attributes
+        assert "Attributes:" in doc
+        return
+    for section in ("Args:", "Raises:", "Example:", ">>>", "Source:"):
+        assert section in doc, section
+
+
+@pytest.mark.parametrize("name", jeuler.__all__)
+def test_public_name_has_a_line_in_the_readme(name):
+    table = re.findall(r"^\| `(\w+)", (ROOT / "README.md").read_text(), flags=re.MULTILINE)
+    assert name in table
+
+
+def test_every_step_force_and_effect_has_a_row():
+    steps = {name for name in jeuler.__all__ if name.endswith("_step")}
+    assert steps == {method.step.__name__ for method in cases.METHODS.values()}
+    from jeuler import effects, forces
+
+    made = {type(build()).__name__ for build in (*cases.FORCES.values(), *cases.EFFECTS.values())}
+    assert set(forces.__all__) <= made
+    assert {name for name in effects.__all__ if name != "SampledPath"} <= made
+
+
+def test_public_names_are_sorted_and_exist():
+    assert sorted(jeuler.__all__) == jeuler.__all__
+    assert jeuler.__version__
+
+
+def test_import_brings_jax_and_nothing_heavier():
+    heavy = "['diffrax', 'equinox', 'optax', 'optimistix', 'lineax', 'matplotlib', 'scipy.signal', 'tqdm']"
+    code = (
+        "import sys, jax; before = set(sys.modules); import jeuler; "
+        f"print([m for m in {heavy} if m in sys.modules and m not in before])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip() == "[]"
