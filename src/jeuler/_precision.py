@@ -1,4 +1,4 @@
-"""Running a part of the work in float64, whatever the precision of the program around it."""
+"""Running a part of the work in a precision of its own, whatever that of the program around it."""
 
 from __future__ import annotations
 
@@ -9,23 +9,46 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+PyTree = Any
+
+
+def precision(dtype: Any) -> AbstractContextManager:
+    """A context whose default floating dtype is ``dtype``, float32 or float64."""
+    double = np.dtype(dtype) == np.float64
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(double)
+    from jax.experimental import enable_x64  # its place before jax 0.8
+
+    return enable_x64(double)
+
 
 def double_precision() -> AbstractContextManager:
     """A context in which float64 exists; float32 arrays keep their dtype in it."""
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(True)
-    from jax.experimental import enable_x64  # its place before jax 0.8
-
-    return enable_x64(True)
+    return precision(np.float64)
 
 
-def cast(x: Any, dtype: Any) -> Any:
-    """The floating leaves of x as arrays of a real dtype, or the complex one of the same precision."""
+def cast(x: PyTree, dtype: Any) -> PyTree:
+    """x with its floating leaves as arrays of a real dtype, its complex ones in the same precision."""
 
     def leaf(v: Any) -> Any:
-        if not jnp.issubdtype(jnp.result_type(v), jnp.inexact):
+        kind = jnp.result_type(v)
+        if not jnp.issubdtype(kind, jnp.inexact):
             return v
-        complex_leaf = jnp.issubdtype(jnp.result_type(v), jnp.complexfloating)
-        return jnp.asarray(np.asarray(v), dtype=np.result_type(dtype, np.complex64) if complex_leaf else dtype)
+        to_complex = jnp.issubdtype(kind, jnp.complexfloating)
+        return jnp.asarray(np.asarray(v), dtype=np.result_type(dtype, np.complex64) if to_complex else dtype)
 
     return jax.tree.map(leaf, x)
+
+
+def flat(y: PyTree) -> np.ndarray:
+    """Every number in y as one float64 vector on the host, complex ones as pairs."""
+    leaves = [np.asarray(leaf).ravel() for leaf in jax.tree.leaves(y)]
+    parts = [v.view(v.real.dtype) if np.iscomplexobj(v) else v for v in leaves]
+    return np.concatenate([v.astype(np.float64) for v in parts]) if parts else np.zeros(0)
+
+
+def flat_rows(y: PyTree) -> np.ndarray:
+    """The same for each entry of a leading axis: (saved, number)."""
+    leaves = [np.asarray(leaf).reshape(np.shape(leaf)[0], -1) for leaf in jax.tree.leaves(y)]
+    parts = [v.view(v.real.dtype) if np.iscomplexobj(v) else v for v in leaves]
+    return np.concatenate([v.astype(np.float64) for v in parts], axis=1)
