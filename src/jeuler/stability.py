@@ -235,11 +235,12 @@ def _unit_pairs():
 def treats_all_alike(step: Step) -> bool:
     """Whether the step commutes with a linear change of variables, so that eigenvalues say all about it."""
 
+    @jax.jit
     def image(matrix):
         def field(t, y, args):
             return matrix[0, 0] * y[0] + matrix[0, 1] * y[1], matrix[1, 0] * y[0] + matrix[1, 1] * y[1]
 
-        return np.array([step(field, 0.0, start, 1.0, None) for start in _unit_pairs()], dtype=float).T
+        return jnp.array([step(field, 0.0, start, 1.0, None) for start in _unit_pairs()]).T
 
     with double_precision():
         field = np.array([[0.1, 0.7], [-0.4, -0.3]])

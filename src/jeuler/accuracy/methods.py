@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler.accuracy.timing import counting
 from jeuler.extrapolation import ExtrapolatedStep, solve_adaptive
 from jeuler.methods import Step, VectorField
 from jeuler.solve import solve
@@ -64,16 +64,12 @@ def named(steps: Any) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class FixedRun:
-    """num_steps equal steps of a method from t0 to t1."""
+    """num_steps equal steps of a method from t0."""
 
     method: Any
     t0: float
-    t1: float
+    dt: Any
     num_steps: int
-
-    @property
-    def dt(self) -> float:
-        return (self.t1 - self.t0) / self.num_steps
 
     @property
     def saved(self) -> int:
@@ -81,9 +77,9 @@ class FixedRun:
         return max(d for d in range(1, MOST_SAVED + 1) if self.num_steps % d == 0)
 
     @property
-    def times(self) -> np.ndarray:
+    def times(self) -> Any:
         """The times of the states kept."""
-        return self.t0 + (self.t1 - self.t0) * np.arange(self.saved + 1) / self.saved
+        return self.t0 + self.num_steps * self.dt * (np.arange(self.saved + 1) / self.saved)
 
     def __call__(self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None) -> tuple[PyTree, jax.Array, jax.Array]:
         """States at the times, first non-finite step (-1 none), steps taken."""
@@ -108,10 +104,6 @@ class FixedRun:
         )
         return run.y, run.first_nonfinite, jnp.int32(self.num_steps)
 
-    def shortened(self, num_steps: int) -> FixedRun:
-        """The first steps of the run, with the same dt."""
-        return FixedRun(self.method, self.t0, self.t0 + num_steps * self.dt, num_steps)
-
 
 @dataclasses.dataclass(frozen=True)
 class AdaptiveRun:
@@ -120,7 +112,7 @@ class AdaptiveRun:
     method: Any
     t0: float
     t1: float
-    tolerance: float
+    tolerance: Any
 
     @property
     def times(self) -> np.ndarray:
@@ -174,12 +166,36 @@ def _time_dtype(y0: PyTree) -> Any:
 
 def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
     """The run whose dt is nearest to the one asked for and divides the interval."""
-    return FixedRun(method, t0, t1, max(1, round((t1 - t0) / dt)))
+    num_steps = max(1, round((t1 - t0) / dt))
+    return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
 
 
-def evaluations(run: FixedRun | AdaptiveRun, f: VectorField, y0: PyTree, args: PyTree, count: Callable) -> float:
-    """Evaluations of f in the run: counted over its first steps and scaled, since all are alike but for iterations."""
-    if isinstance(run, AdaptiveRun) or run.num_steps <= 8:
-        return count(lambda g: run(g, y0, args), f)
-    four, eight = (count(lambda g, k=k: run.shortened(k)(g, y0, args), f) for k in (4, 8))
-    return math.floor(eight + (eight - four) / 4 * (run.num_steps - 8) + 0.5)
+def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[int]:
+    """Evaluations of f in each run of one method, counted while they run.
+
+    A run of equal steps is counted over its first 4 and 8 steps and scaled up: exact but for steps that iterate.
+    """
+
+    def counter(make_run: Callable) -> Callable:
+        counted, read = counting(f)
+        program = jax.jit(lambda x: make_run(x)(counted, y0, args))
+
+        def count(x: float) -> int:
+            jax.block_until_ready(program(x))
+            return read()
+
+        return count
+
+    def fixed(num_steps):
+        return counter(lambda dt: FixedRun(plan[0].method, plan[0].t0, dt, num_steps))
+
+    four, eight = fixed(4), fixed(8)
+    adaptive = counter(lambda tolerance: dataclasses.replace(run, tolerance=tolerance))
+    counts = []
+    for run in plan:
+        if isinstance(run, AdaptiveRun):
+            counts.append(adaptive(run.tolerance))
+        else:
+            few, more = four(run.dt), eight(run.dt)
+            counts.append(round(more + (more - few) / 4 * (run.num_steps - 8)))
+    return counts

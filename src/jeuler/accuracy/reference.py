@@ -45,7 +45,8 @@ def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, tim
 
     if reference is None or isinstance(reference, diffrax.AbstractSolver):
         solver = diffrax.Dopri8() if reference is None else reference
-        loose, tight = (flat_rows(accurate(f, y0, args, times, solver, tolerance)) for tolerance in TOLERANCES)
+        run = jax.jit(lambda tolerance: accurate(f, y0, args, times, solver, tolerance))
+        loose, tight = (flat_rows(run(tolerance)) for tolerance in TOLERANCES)
         if not np.all(np.isfinite(tight)):
             raise ValueError(
                 f"reference must be finite, got NaN or inf from {type(solver).__name__} at tolerance {TOLERANCES[1]}; give "
@@ -66,12 +67,13 @@ def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, tim
     return Reference(times, states, 0.0)
 
 
-def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, tolerance: float) -> PyTree:
+def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, tolerance: Any) -> PyTree:
     """States at the times by an adaptive diffrax solver that steps exactly to each of them. Differentiable."""
     import diffrax
 
-    size = np.linalg.norm(flat(y0)) if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(y0)) else 1.0
-    control = diffrax.PIDController(rtol=tolerance, atol=tolerance * max(size, 1e-3))
+    control = diffrax.PIDController(rtol=tolerance, atol=tolerance * max(np.linalg.norm(flat(y0)), 1e-3))
+    if len(times) > 2:
+        control = diffrax.ClipStepSizeController(control, step_ts=jnp.asarray(times))
     return diffrax.diffeqsolve(
         diffrax.ODETerm(f),
         solver,
@@ -81,7 +83,7 @@ def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, 
         y0,
         args,
         saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
-        stepsize_controller=diffrax.ClipStepSizeController(control, step_ts=jnp.asarray(times)),
+        stepsize_controller=control,
         max_steps=1_000_000,
         throw=False,
     ).ys
@@ -103,13 +105,12 @@ def make_reference_gradient(
 
     solver = reference if isinstance(reference, diffrax.AbstractSolver) else diffrax.Dopri8()
 
-    def gradient(tolerance):
-        def final(args):
-            return scalar(jax.tree.map(lambda leaf: leaf[-1], accurate(f, y0, args, (t0, t1), solver, tolerance)))
+    def final(args, tolerance):
+        states = accurate(f, y0, args, np.array([t0, t1]), solver, tolerance)
+        return scalar(jax.tree.map(lambda leaf: leaf[-1], states))
 
-        return flat(jax.jit(jax.grad(final))(args))
-
-    loose, tight = (gradient(tolerance) for tolerance in TOLERANCES)
+    gradient = jax.jit(jax.grad(final))
+    loose, tight = (flat(gradient(args, tolerance)) for tolerance in TOLERANCES)
     return ReferenceGradient(tight, float(np.linalg.norm(tight - loose)))
 
 

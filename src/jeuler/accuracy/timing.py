@@ -56,8 +56,8 @@ def measure(function: Callable, *inputs: Any, repeats: int = 5, patience: float 
     return Measurement(result, compile_seconds, runs, getattr(memory, "temp_size_in_bytes", -1))
 
 
-def count_evaluations(run: Callable[[Callable], Any], f: Callable) -> int:
-    """How often f is evaluated while ``run(f)`` runs, counted as it runs: loops that end by a test included."""
+def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
+    """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and reset it."""
     count = 0
 
     def add_one() -> None:
@@ -68,6 +68,10 @@ def count_evaluations(run: Callable[[Callable], Any], f: Callable) -> int:
         jax.debug.callback(add_one)
         return f(t, y, args)
 
-    jax.block_until_ready(run(counted))
-    jax.effects_barrier()
-    return count
+    def read() -> int:
+        nonlocal count
+        jax.effects_barrier()
+        counted_so_far, count = count, 0
+        return counted_so_far
+
+    return counted, read

@@ -14,7 +14,7 @@ from jeuler._precision import cast, double_precision, flat, flat_rows, precision
 from jeuler.accuracy.methods import AdaptiveRun, Compensated, FixedRun, evaluations, fixed_grid, is_adaptive, is_diffrax, named
 from jeuler.accuracy.reference import Reference, ReferenceGradient, error_norms, make_reference, make_reference_gradient
 from jeuler.accuracy.table import EMPTY_ROW, WorkPrecision, mark_pareto
-from jeuler.accuracy.timing import count_evaluations, measure
+from jeuler.accuracy.timing import measure
 from jeuler.methods import VectorField
 from jeuler.stability import stability_limit
 
@@ -100,6 +100,7 @@ def work_precision(
         slope = None
         if gradient is not None:
             slope = make_reference_gradient(gradient, reference, f, y64, args64, t0, t1)
+        counts = {name: evaluations(plan, f, y64, args64) for name, plan in plans.items()}
         limits = {name: _limit(method, f, t0, y64, args64) for name, method in methods.items()}
 
     rows: list[dict[str, Any]] = []
@@ -110,9 +111,9 @@ def work_precision(
                 problem = f, cast(y0, dtype), cast(args, dtype)
                 for name, plan in plans.items():
                     pace = 0.0  # seconds a step of the run before, coarser
-                    for run in plan:
+                    for run, count in zip(plan, counts[name], strict=True):
                         bar.set_postfix_str(f"{name} {dtype}")
-                        row = EMPTY_ROW | {"method": name, "dtype": str(dtype)}
+                        row = EMPTY_ROW | {"method": name, "dtype": str(dtype), "evaluations": count}
                         row |= _row(run, problem, truth, pace, repeats, timeout)
                         if gradient is not None and not row["reason"]:
                             row |= _gradient_row(run, problem, gradient, slope, repeats, timeout, adjoint)
@@ -157,7 +158,6 @@ def _row(run, problem, truth: Reference, pace: float, repeats: int, timeout: flo
     if int(lost) >= 0 or not np.all(np.isfinite(states)):
         at = f"at step {int(lost)}" if int(lost) >= 0 else "at the end"
         return row | {"reason": f"blew up: not finite {at} of {int(num_steps)}"}
-    row["evaluations"] = evaluations(run, f, y0, args, count_evaluations)
     return row | error_norms(states, truth.at(run.times))
 
 
