@@ -41,14 +41,12 @@ def cast(x: PyTree, dtype: Any) -> PyTree:
 
 
 def flat(y: PyTree) -> np.ndarray:
-    """Every number in y as one float64 vector on the host, complex ones as pairs."""
-    leaves = [np.asarray(leaf).ravel() for leaf in jax.tree.leaves(y)]
-    parts = [v.view(v.real.dtype) if np.iscomplexobj(v) else v for v in leaves]
-    return np.concatenate([v.astype(np.float64) for v in parts]) if parts else np.zeros(0)
+    """Every number in y as one float64 vector on the host, real parts of a leaf first."""
+    return flat_rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], y))[0]
 
 
 def flat_rows(y: PyTree) -> np.ndarray:
     """The same for each entry of a leading axis: (saved, number)."""
     leaves = [np.asarray(leaf).reshape(np.shape(leaf)[0], -1) for leaf in jax.tree.leaves(y)]
-    parts = [v.view(v.real.dtype) if np.iscomplexobj(v) else v for v in leaves]
-    return np.concatenate([v.astype(np.float64) for v in parts], axis=1)
+    parts = [part for v in leaves for part in ((v.real, v.imag) if np.iscomplexobj(v) else (v,))]
+    return np.concatenate([part.astype(np.float64) for part in parts], axis=1)

@@ -80,107 +80,117 @@ def stability_limit(
     y = _check.state("y", y)
     _check.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
     with double_precision():
-        linear = Linearisation(f, t, cast(y, np.float64), cast(args, np.float64))
-        rates, modes = linear.eigen()
-        scale = np.abs(rates).max(initial=0.0)
-        if growing == "unstable" and np.any(rates.real > UNDAMPED * scale):
-            return 0.0
-        counts = (np.abs(rates) > NEUTRAL * scale) & (rates.real <= UNDAMPED * scale)
-        rates = rates[counts]
-        rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
-        if not rates.size:
-            return math.inf
-        if treats_all_alike(step):
-            return float(np.min(scalar_limits(step, rates)))
-        stiffness, damping = linear.modal(rates, modes[:, counts])
-        limit = float(np.min(pair_limits(step, stiffness, damping)))
-        return linear.refined(step, limit)
+        linear = Linearisation(f, cast(y, np.float64), cast(args, np.float64))
+        return linear.limits(t, linear.flat, step, growing=growing)[0]
 
 
 class Linearisation:
-    """The linear field J u around one state: as products, as a matrix where it is small, and by its eigenvalues."""
+    """The linear field J u around states of one form: as products, as a matrix where it is small, by its modes."""
 
-    def __init__(self, f: VectorField, t: Any, y: PyTree, args: Any) -> None:
-        self.complex = any(jnp.iscomplexobj(leaf) for leaf in jax.tree.leaves(y))
-        leaves, self.structure = jax.tree.flatten(y)
-        parts = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
-        self.flat, self.unflatten = ravel_pytree(parts)  # complex numbers as pairs of real ones
+    def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
+        leaves, structure = jax.tree.flatten(y)
+        split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
+        self.complex = any(isinstance(part, tuple) for part in split)
+        self.flat, restore = ravel_pytree(split)  # complex numbers as pairs of real ones
 
-        def real_field(flat):
-            leaves = [jax.lax.complex(*p) if isinstance(p, tuple) else p for p in self.unflatten(flat)]
-            slopes = jax.tree.leaves(f(t, jax.tree.unflatten(self.structure, leaves), args))
-            parts = [(s.real, s.imag) if isinstance(p, tuple) else s for s, p in zip(slopes, leaves_of, strict=True)]
+        def unflatten(flat):
+            parts = [jax.lax.complex(*part) if isinstance(part, tuple) else part for part in restore(flat)]
+            return jax.tree.unflatten(structure, parts)
+
+        def real_field(t, flat):
+            slopes = structure.flatten_up_to(f(t, unflatten(flat), args))
+            pairs = zip(slopes, split, strict=True)
+            parts = [(jnp.real(s), jnp.imag(s)) if isinstance(part, tuple) else s for s, part in pairs]
             return ravel_pytree(parts)[0].astype(flat.dtype)
 
-        leaves_of = parts
-        self.product = jax.jit(lambda u: jax.jvp(real_field, (self.flat,), (u,))[1])
+        def product(t, flat, u):
+            return jax.jvp(lambda flat: real_field(t, flat), (flat,), (u,))[1]
 
-    @functools.cached_property
-    def matrix(self) -> np.ndarray:
-        return np.asarray(jax.vmap(self.product, out_axes=1)(jnp.eye(self.flat.size)))
+        self.unflatten = unflatten
+        self.product = jax.jit(product)
+        self.products = jax.jit(jax.vmap(product, in_axes=(None, None, 1), out_axes=1))
 
-    def eigen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues, all or the extreme ones, and their eigenvectors as columns."""
+    def limits(
+        self, t: Any, flat: Any, step: Step, *, growing: str = "skip", interval: float = math.inf
+    ) -> tuple[float, float]:
+        """The largest stable dt at a state, and the largest at which no stable mode grows beyond e within an interval."""
+        rates, modes, matrix = self.eigen(t, flat)
+        scale = np.abs(rates).max(initial=0.0)
+        if growing == "unstable" and np.any(rates.real > UNDAMPED * scale):
+            return 0.0, 0.0
+        counts = (np.abs(rates) > NEUTRAL * scale) & (rates.real <= UNDAMPED * scale)
+        if not counts.any():
+            return math.inf, math.inf
+        chosen = np.resize(np.flatnonzero(counts), rates.size)  # always as many, so that one program serves all states
+        rates, modes = rates[chosen], modes[:, chosen]
+        rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
+        if treats_all_alike(step):
+            limit = float(np.min(scalar_limits(step, rates)))
+            bound = limit if math.isinf(interval) else float(np.min(scalar_limits(step, rates, interval)))
+            return limit, max(limit, bound)
+        stiffness, damping = self.modal(t, flat, rates, modes)
+        limit = float(np.min(pair_limits(step, stiffness, damping)))
+        bound = limit if math.isinf(interval) else float(np.min(pair_limits(step, stiffness, damping, interval)))
+        return (limit if matrix is None else self.refined(step, matrix, limit)), max(limit, bound)
+
+    def eigen(self, t: Any, flat: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is small."""
         n = self.flat.size
-        small = n <= DENSE
-        if not np.all(np.isfinite(self.matrix if small else self.product(jnp.ones(n)))):
+        matrix = np.asarray(self.products(t, flat, jnp.eye(n))) if n <= DENSE else None
+        if not np.all(np.isfinite(self.product(t, flat, jnp.ones(n)) if matrix is None else matrix)):
             raise ValueError(
                 "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; give a state at which f is smooth"
             )
-        if small:
-            rates, modes = np.linalg.eig(self.matrix)
-            return rates.astype(complex), modes.astype(complex)
+        if matrix is not None:
+            rates, modes = np.linalg.eig(matrix)
+            return rates.astype(complex), modes.astype(complex), matrix
         from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 
-        operator = LinearOperator((n, n), matvec=lambda u: np.asarray(self.product(jnp.asarray(u).ravel())), dtype=float)
+        operator = LinearOperator(
+            (n, n), matvec=lambda u: np.asarray(self.product(t, flat, jnp.asarray(u).ravel())), dtype=float
+        )
+        start = np.random.default_rng(0).standard_normal(n)
         found = []
         for which in ("LM", "LR", "LI"):
-            start = np.random.default_rng(0).standard_normal(n)
             try:
                 found.append(eigs(operator, k=EXTREMES, which=which, v0=start, tol=1e-6, maxiter=20 * EXTREMES))
             except ArpackNoConvergence as partial:
                 found.append((partial.eigenvalues, partial.eigenvectors))
-        return np.concatenate([r for r, _ in found]), np.concatenate([v for _, v in found], axis=1)
+        return np.concatenate([r for r, _ in found]), np.concatenate([v for _, v in found], axis=1), None
 
-    def modal(self, rates: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def modal(self, t: Any, flat: Any, rates: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Stiffness k and damping c of each mode of a second-order system, from its shape.
 
-            lambda^2 x = A x + lambda B x  =>  k = -x* A x / x* x,  c = -x* B x / x* x
+        lambda^2 x = A x + lambda B x  =>  k = -x* A x / x* x,  c = -x* B x / x* x
         """
         half = self.flat.size // 2
         shape = modes[half:]
         still = np.zeros_like(shape)
-        products = jax.vmap(self.product, in_axes=1, out_axes=1)
 
         def quotient(direction):
-            image = np.asarray(products(jnp.asarray(direction.real))) + 1j * np.asarray(
-                products(jnp.asarray(direction.imag))
-            )
-            return -np.sum(shape.conj() * image[half:], axis=0) / np.sum(np.abs(shape) ** 2, axis=0)
+            real, imaginary = (self.products(t, flat, jnp.asarray(part)) for part in (direction.real, direction.imag))
+            image = np.asarray(real)[half:] + 1j * np.asarray(imaginary)[half:]
+            return (-np.sum(shape.conj() * image, axis=0) / np.sum(np.abs(shape) ** 2, axis=0)).real
 
-        stiffness = quotient(np.concatenate([shape, still])).real
-        damping = quotient(np.concatenate([still, shape])).real
-        damping = np.where(rates.real == 0, 0.0, damping)
-        return stiffness, damping
+        stiffness = quotient(np.concatenate([shape, still]))
+        damping = quotient(np.concatenate([still, shape]))
+        return stiffness, np.where(rates.real == 0, 0.0, damping)
 
-    def refined(self, step: Step, limit: float) -> float:
+    def refined(self, step: Step, matrix: np.ndarray, limit: float) -> float:
         """The limit by bisection on the spectral radius of the whole step, where the system is small enough.
 
         Exact also where damping couples the modes, which the modal limit is not.
         """
-        if not (0 < limit < math.inf) or self.flat.size > DENSE // 4 or self.complex:
+        if not 0 < limit < math.inf or self.flat.size > DENSE // 4 or self.complex:
             return limit
-        matrix = jnp.asarray(self.matrix)
 
-        def linear(t, y, args):
-            return unflatten(matrix @ ravel_pytree(y)[0])
-
-        _, unflatten = ravel_pytree(jax.tree.unflatten(self.structure, self.unflatten(self.flat)))
+        def linear(t, y, matrix):
+            return self.unflatten(matrix @ ravel_pytree(y)[0])
 
         @jax.jit
         def image(dt):
-            columns = jax.vmap(lambda u: ravel_pytree(step(linear, 0.0, unflatten(u), dt, None))[0])
-            return columns(jnp.eye(matrix.shape[0])).T
+            columns = jax.vmap(lambda u: ravel_pytree(step(linear, 0.0, self.unflatten(u), dt, matrix))[0])
+            return columns(jnp.eye(len(matrix))).T
 
         def stable(dt):
             return np.abs(np.linalg.eigvals(np.asarray(image(dt)))).max() <= 1 + 1e-6
@@ -249,29 +259,30 @@ def treats_all_alike(step: Step) -> bool:
         return bool(np.allclose(image(field), other, rtol=1e-4, atol=1e-4))
 
 
-def scalar_limits(step: Step, rates: np.ndarray) -> np.ndarray:
+def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> np.ndarray:
     """The largest stable dt of each eigenvalue, Re <= 0."""
     size = np.abs(rates)
-    return largest_stable(functools.partial(_scalar_gain, step, rates / size), len(rates)) / size
+    return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
 
 
-def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
+def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf) -> np.ndarray:
     """The largest stable dt of each mode x'' = -k x - c x'."""
     size = np.sqrt(np.abs(stiffness)) + np.abs(damping)
     gain = functools.partial(_pair_gain, step, stiffness / size**2, damping / size)
-    return largest_stable(gain, len(stiffness)) / size
+    return largest_stable(gain, 1 / (size * interval)) / size
 
 
-def largest_stable(gain: Callable[[np.ndarray], jax.Array], modes: int) -> np.ndarray:
+def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
     """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if endless.
 
-    gain: |R| at s, both of shape (mode, point).
+    gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|, (mode,).
     """
     points, lasting = 801, 25  # 50 points a decade; a gain above 1 over half a decade is not the noise of a solve
+    modes = len(growth)
     s = np.broadcast_to(np.logspace(-8, 8, points), (modes, points))
 
     def excess(s):
-        above = np.asarray(gain(s)) - 1
+        above = np.asarray(gain(s)) - 1 - growth[:, None] * s
         return np.where(np.isfinite(above), above, np.inf)
 
     above = excess(s)
