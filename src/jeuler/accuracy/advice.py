@@ -129,17 +129,25 @@ class _Adviser:
         while start * self.bound < self.interval:
             start *= 2
         if 2 * start > self.most:
-            return self._refuse(
-                f"stability alone asks for dt <= {self.bound:.3g} s, {self.interval / self.bound:.3g} steps, more than "
-                f"the {self.most:,} of a pilot run; use implicit_euler_step or linearly_implicit_euler_step"
-            )
+            return self._refuse(f"{self._stability_asks()}, more than pilot runs of {self.most:,} can look into")
         ladder = self._climb(start)
         if ladder is None:
+            if self.bound * self.most < 16 * self.interval:
+                return self._refuse(f"{self._stability_asks()}; pilot runs of {self.most:,} cannot tell its error")
             return self._refuse(
-                f"the step did not settle to its order within {self.most:,} steps, so no error can be predicted; use "
-                f"rk4_step or an adaptive solver, or raise max_pilot_steps"
+                f"the error of {self.name} did not fall as its order says within {self.most:,} steps, so none can be "
+                f"predicted; use {self._finer_step()} or an adaptive solver, or raise max_pilot_steps"
             )
         return self._answer(ladder)
+
+    def _stability_asks(self) -> str:
+        need = f"dt <= {self.bound:.3g} s, {self.interval / self.bound:.3g} steps"
+        if self.stability < 0.5 * self.bound:  # an oscillation that the step makes grow
+            return f"oscillations that {self.name} makes grow ask for {need} (use rk4_step or symplectic_euler_step)"
+        return f"stability alone asks for {need} (use implicit_euler_step or linearly_implicit_euler_step)"
+
+    def _finer_step(self) -> str:
+        return "heun_step, rk4_step" if self._order() < 4 else "extrapolated_euler(8)"
 
     def _order(self) -> int:
         return int(getattr(self.step, "order", 1))
@@ -203,12 +211,14 @@ class _Adviser:
         if num_steps < least:
             num_steps, how = least, "set by stability, which asks for more than the target does"
             predicted = float(np.linalg.norm(self.pilot(num_steps)[-1] - ladder.best))
+        elif predicted < aim / 3:
+            how = "set by stability: with fewer steps the run is lost, with these it is better than the target"
         self.floor = rounding.least_total(predicted / scale * num_steps**p, p)
         total = predicted / scale + rounding.at(num_steps)
         if total > 1.25 * self.error:
-            cures = [] if self.compensated else ["compensated=True"]
+            cures = [] if self.compensated or not hasattr(self.step, "increment") else ["compensated=True"]
             cures += ["float64"] if self.dtype == np.float32 else []
-            cures += ["rk4_step" if p < 4 else "a smaller target"]
+            cures += [self._finer_step()]
             return self._refuse(
                 f"roundoff: in {self.dtype} {self.name} does not get below an error of about {self.floor:.1e}, above the "
                 f"target {self.error:.1e}; use {' or '.join(cures)}",
@@ -216,12 +226,12 @@ class _Adviser:
             )
         if num_steps > COUNTER:
             return self._refuse(
-                f"the target asks for {num_steps:.3g} steps, more than the clock can count; use "
-                f"{'heun_step, rk4_step or ' if p < 4 else ''}an adaptive solver"
+                f"the target asks for {num_steps:.3g} steps, more than the clock can count; use {self._finer_step()} or an "
+                f"adaptive solver"
             )
         reason = f"{num_steps:,} steps: {how}"
         if how.startswith("predicted") and num_steps > 10_000_000 and p == 1:
-            reason += "; rk4_step would need far fewer"
+            reason += "; heun_step or rk4_step would need far fewer"
         return StepAdvice(
             self.interval / num_steps, num_steps, total, self.stability, self.floor, True, reason
         )
@@ -252,7 +262,7 @@ class _Adviser:
 
     def _rounding(self, ladder: Ladder, scale: float) -> Rounding:
         """Roundoff against steps: the difference between pilots in float32 and in float64."""
-        counts = [n for n in ladder.num_steps if n <= 2**20][-4:]
+        counts = [n for n in ladder.num_steps if n <= 2**18][-4:]
         found = []
         for n in counts:
             rough, fine = self.rough_pilot(n)[-1], ladder.finals[ladder.num_steps.index(n)]
