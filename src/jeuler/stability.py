@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jeuler import _check
+from jeuler import _check, _tree
 from jeuler._precision import cast, double_precision
 from jeuler.methods import Step, VectorField, euler_step
 
 PyTree = Any
 
 DENSE = 512  # numbers in the state up to which all eigenvalues are computed
-NEUTRAL = 1e-7  # |eigenvalue| below this part of the largest is a zero mode: a double zero splits by sqrt(eps)
+NEUTRAL = 4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
 UNDAMPED = 1e-10  # |real part| below this part of the largest eigenvalue is zero up to roundoff
 ROUNDOFF = 1e-15  # |R| - 1 below this is 0
 EXTREMES = 8  # eigenvalues asked for at each end of a large spectrum
@@ -45,8 +45,8 @@ def stability_limit(
     Explicit Euler: dt <= -2 Re(lambda) / |lambda|^2, so 2 z / omega for an oscillator of damping ratio z < 1, and 0
     without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no limit, inf.
 
-    The limit belongs to the state: look at it where the system is stiffest. Eigenvalues that are 0 (a system that can
-    drift) do not count. Up to 512 numbers in the state all eigenvalues are computed; above, Arnoldi iteration on
+    The limit belongs to the state: look at it where the system is stiffest. Eigenvalues that are 0
+    up to the roundoff of the data (a system that can drift) do not count. Up to 512 numbers in the state all eigenvalues are computed; above, Arnoldi iteration on
     Jacobian-vector products finds those of the largest modulus, real part and imaginary part, and the limit is that
     of these. Computed in float64 on the host, so it is not for use under jit.
 
@@ -80,7 +80,7 @@ def stability_limit(
     y = _check.state("y", y)
     _check.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
     with double_precision():
-        linear = Linearisation(f, cast(y, np.float64), cast(args, np.float64))
+        linear = Linearisation(f, y, args)
         return linear.limits(t, linear.flat, step, growing=growing)[0]
 
 
@@ -88,6 +88,8 @@ class Linearisation:
     """The linear field J u around states of one form: as products, as a matrix where it is small, by its modes."""
 
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
+        self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # of the precision of the data
+        y, args = cast(y, np.float64), cast(args, np.float64)
         leaves, structure = jax.tree.flatten(y)
         split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
         self.complex = any(isinstance(part, tuple) for part in split)
@@ -118,7 +120,7 @@ class Linearisation:
         scale = np.abs(rates).max(initial=0.0)
         if growing == "unstable" and np.any(rates.real > UNDAMPED * scale):
             return 0.0, 0.0
-        counts = (np.abs(rates) > NEUTRAL * scale) & (rates.real <= UNDAMPED * scale)
+        counts = (np.abs(rates) > self.neutral * scale) & (rates.real <= UNDAMPED * scale)
         if not counts.any():
             return math.inf, math.inf
         chosen = np.resize(np.flatnonzero(counts), rates.size)  # always as many, so that one program serves all states

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jeuler import _check, _tree
-from jeuler._precision import cast, double_precision, flat
+from jeuler._precision import double_precision, flat
 from jeuler.accuracy.pilot import Ladder, Pilot
 from jeuler.methods import Step, VectorField, euler_step
 from jeuler.stability import Linearisation
@@ -115,7 +115,7 @@ class _Adviser:
         self.dtype = np.dtype(_tree.time_dtype(y0))
         with double_precision():
             self.y0 = flat(y0)
-            self.linear = Linearisation(f, cast(y0, np.float64), cast(args, np.float64))
+            self.linear = Linearisation(f, y0, args)
         self.pilot = Pilot(f, y0, t0, t1, args, step, np.float64, compensated)
         self.rough_pilot = Pilot(f, y0, t0, t1, args, step, np.float32, compensated)
         self.name = getattr(step, "__name__", "this step")

@@ -131,7 +131,8 @@ class AdaptiveRun:
                 atol=self.tolerance,
                 max_steps=MOST_ADAPTIVE_STEPS,
             )
-            return run.y, jnp.where(run.finished, -1, run.num_steps), run.num_steps
+            tried = run.num_steps + run.num_rejected
+            return run.y, jnp.where(run.finished, -1, tried), tried
         import diffrax
 
         controller = diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance)
@@ -170,19 +171,20 @@ def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
     return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
 
 
-def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[int]:
-    """Evaluations of f in each run of one method, counted while they run.
+def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[Callable]:
+    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps are taken.
 
-    A run of equal steps is counted over its first 4 and 8 steps and scaled up: exact but for steps that iterate.
+    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and scaled to
+    the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not counted.
     """
 
     def counter(make_run: Callable) -> Callable:
         counted, read = counting(f)
-        program = jax.jit(lambda x: make_run(x)(counted, y0, args))
+        program = jax.jit(lambda x: make_run(x)(counted, y0, args)[2])
 
-        def count(x: float) -> int:
-            jax.block_until_ready(program(x))
-            return read()
+        def count(x: float) -> tuple[int, int]:
+            num_steps = int(program(x))
+            return read(), num_steps
 
         return count
 
@@ -191,11 +193,13 @@ def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTr
 
     four, eight = fixed(4), fixed(8)
     adaptive = counter(lambda tolerance: dataclasses.replace(run, tolerance=tolerance))
-    counts = []
+    laws = []
     for run in plan:
         if isinstance(run, AdaptiveRun):
-            counts.append(adaptive(run.tolerance))
+            all_of_them, taken = adaptive(run.tolerance)
+            first, each = 0.0, all_of_them / taken
         else:
-            few, more = four(run.dt), eight(run.dt)
-            counts.append(round(more + (more - few) / 4 * (run.num_steps - 8)))
-    return counts
+            few, more = four(run.dt)[0], eight(run.dt)[0]
+            first, each = 2 * few - more, (more - few) / 4
+        laws.append(lambda num_steps, first=first, each=each: round(first + each * num_steps))
+    return laws

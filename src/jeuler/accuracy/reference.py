@@ -14,7 +14,7 @@ from jeuler._precision import flat, flat_rows
 from jeuler.methods import VectorField
 
 PyTree = Any
-TOLERANCES = 1e-10, 1e-12  # relative and, times the size of y0, absolute; the second is the reference
+TOLERANCES = 1e-11, 1e-13  # relative and, times the size of y0, absolute; the second is the reference
 
 
 @dataclasses.dataclass(frozen=True)

@@ -114,7 +114,7 @@ class WorkPrecision:
                 writer.writerow({k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()})
 
     def to_markdown(self) -> str:
-        """One line a method and dt (or tolerance); each precision has its columns. Bold is on the Pareto front."""
+        """One line a method and dt (or tolerance); each precision has its columns. Bold: on the Pareto front."""
         dtypes = list(dict.fromkeys(row["dtype"] for row in self.rows))
         gradient = any(math.isfinite(row["gradient_error"]) for row in self.rows)
         columns = ["relative error", "seconds", *(["gradient error", "gradient seconds", "MiB"] if gradient else [])]
@@ -158,11 +158,11 @@ def _count(n: int) -> str:
 
 
 def mark_pareto(rows: list[dict[str, Any]]) -> None:
-    """Mark the rows that no other row beats in both error and seconds."""
+    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no result."""
     for row in rows:
         row["pareto"] = False
     best = math.inf
-    able = [row for row in rows if math.isfinite(row["error_final"]) and math.isfinite(row["run_seconds_min"])]
+    able = [row for row in rows if math.isfinite(row["error_final"]) and not row["error_final_relative"] > 1]
     for row in sorted(able, key=lambda row: (row["run_seconds_min"], row["error_final"])):
         if row["error_final"] < best:
             row["pareto"], best = True, row["error_final"]
@@ -172,11 +172,11 @@ def roundoff_floor(dt: np.ndarray, error: np.ndarray) -> tuple[float, float]:
     """The error at which halving dt no longer takes a third off it, and that dt; NaN where that never happens.
 
     dt falls. The floor begins at the largest dt for which every dt of half its size or less has at least 2/3 of its
-    error; it needs two of them, or one that is larger than the error.
+    error.
     """
     for i in range(len(dt)):
         finer = error[dt <= dt[i] / 2 * (1 + 1e-6)]
-        if finer.size and np.all(finer >= error[i] * 2 / 3) and (finer.size > 1 or finer[0] > error[i]):
+        if finer.size and np.all(finer >= error[i] * 2 / 3):
             return float(error[i:].min()), float(dt[i])
     return NAN, NAN
 
@@ -186,11 +186,11 @@ def fitted_order(
 ) -> float:
     """Least-squares slope of log error over log dt from the finest four points that are above the floor.
 
-    Above the floor: dt > floor_dt and ten times its error; and not beyond 30 % relative error, where no power law holds.
+    Above the floor: dt > floor_dt and four times the floor; and not beyond 30 % relative error, where no power law holds.
     """
     use = np.isfinite(error) & (error > 0) & ~(relative > 0.3)
     if math.isfinite(floor):
-        use &= (dt > floor_dt) & (error > 10 * floor)
+        use &= (dt > floor_dt) & (error > 4 * floor)
     dt, error = dt[use][-4:], error[use][-4:]
     if len(dt) < 2:
         return NAN

@@ -36,10 +36,13 @@ class Measurement:
         return float(np.median(self.run_seconds))
 
 
-def measure(function: Callable, *inputs: Any, repeats: int = 5, patience: float = float("inf")) -> Measurement:
+def measure(
+    function: Callable, *inputs: Any, repeats: int = 5, budget: float = 1.0, patience: float = float("inf")
+) -> Measurement:
     """Compile function for these inputs, run it once unmeasured, then ``repeats`` times measured.
 
-    A first run longer than ``patience`` seconds is the only one, and is itself the measurement.
+    Fewer times, but at least once, where they would take more than ``budget`` seconds together. A first run longer
+    than ``patience`` seconds is the only one, and is itself the measurement.
     """
     begun = time.perf_counter()
     compiled = jax.jit(function).lower(*inputs).compile()
@@ -51,6 +54,7 @@ def measure(function: Callable, *inputs: Any, repeats: int = 5, patience: float 
         return time.perf_counter() - begun, result
 
     first, result = once()  # carries one-time costs: pages, threads, caches
+    repeats = max(1, min(repeats, int(budget / first)))
     runs = (first,) if first > patience else tuple(once()[0] for _ in range(repeats))
     memory = compiled.memory_analysis()
     return Measurement(result, compile_seconds, runs, getattr(memory, "temp_size_in_bytes", -1))
@@ -60,12 +64,12 @@ def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
     """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and reset it."""
     count = 0
 
-    def add_one() -> None:
+    def add_one(_: Any) -> None:
         nonlocal count
         count += 1
 
     def counted(t, y, args):
-        jax.debug.callback(add_one)
+        jax.debug.callback(add_one, (t, jax.tree.leaves(y)))  # depends on all, so that vmap calls it once a member
         return f(t, y, args)
 
     def read() -> int:

@@ -101,7 +101,7 @@ def work_precision(
         if gradient is not None:
             slope = make_reference_gradient(gradient, reference, f, y64, args64, t0, t1)
         counts = {name: evaluations(plan, f, y64, args64) for name, plan in plans.items()}
-        limits = {name: _limit(method, f, t0, y64, args64) for name, method in methods.items()}
+        limits = {name: _limit(method, f, t0, y0, args) for name, method in methods.items()}
 
     rows: list[dict[str, Any]] = []
     total = len(dtypes) * sum(len(plan) for plan in plans.values())
@@ -113,8 +113,9 @@ def work_precision(
                     pace = 0.0  # seconds a step of the run before, coarser
                     for run, count in zip(plan, counts[name], strict=True):
                         bar.set_postfix_str(f"{name} {dtype}")
-                        row = EMPTY_ROW | {"method": name, "dtype": str(dtype), "evaluations": count}
+                        row = EMPTY_ROW | {"method": name, "dtype": str(dtype)}
                         row |= _row(run, problem, truth, pace, repeats, timeout)
+                        row["evaluations"] = count(row["num_steps"]) if row["num_steps"] > 0 else -1
                         if gradient is not None and not row["reason"]:
                             row |= _gradient_row(run, problem, gradient, slope, repeats, timeout, adjoint)
                         if isinstance(run, FixedRun) and math.isfinite(row["run_seconds_min"]):

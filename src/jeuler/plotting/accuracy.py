@@ -8,112 +8,116 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-LINE = {"float64": "-", "float32": "--", "adaptive": ":"}
+WORST = 3.0  # relative errors above this are off the figure
 
 
 def plot_work_precision(table: Any, ax: Any = None) -> Any:
-    """Draw a `WorkPrecision` table: each method a line with its name at the end.
+    """Draw a `WorkPrecision` table: each method a line with its name beside it.
 
-    Left, relative error at t1 against the least seconds of a run, the Pareto front ringed; right, against dt, with
-    the roundoff floor as a level line where the sweep reached it and the stability limit as a mark on the axis.
+    Left, relative error at t1 against the least seconds of a run, the Pareto front ringed, adaptive runs dotted; right,
+    against dt, with the roundoff floor as a level line where the sweep reached it and the largest stable dt as a
+    triangle. One such row of axes for each precision.
 
     Args:
       table: what `work_precision` returned.
-      ax: None makes a figure with both; one axes takes error against seconds; a pair takes both.
-    Returns: the axes drawn on, one or a pair.
+      ax: None makes a figure; one axes takes error against seconds, a pair takes both, of all precisions.
+    Returns: the axes drawn on: (precision, 2), or as given.
     """
+    dtypes = list(dict.fromkeys(row["dtype"] for row in table.rows))
     if ax is None:
-        _, ax = plt.subplots(1, 2, figsize=(13, 6), constrained_layout=True, sharey=True)
-    pair = isinstance(ax, (tuple, list, np.ndarray))
-    left, right = ax if pair else (ax, None)
-    methods = list(dict.fromkeys(row["method"] for row in table.rows))
-    colour = {method: plt.get_cmap("tab10" if len(methods) <= 10 else "tab20")(i) for i, method in enumerate(methods)}
-    several = len({row["dtype"] for row in table.rows}) > 1
-    labels: dict[Any, list] = {left: [], right: []}
-    for method in methods:
-        for dtype in dict.fromkeys(row["dtype"] for row in table.rows):
-            own = [r for r in table.rows if (r["method"], r["dtype"]) == (method, dtype) and _drawable(r)]
-            fixed = sorted((r for r in own if math.isfinite(r["dt"])), key=lambda r: -r["dt"])
-            adaptive = sorted((r for r in own if math.isfinite(r["tolerance"])), key=lambda r: -r["tolerance"])
-            name = f"{method}, {dtype}" if several else method
-            for rows, style in ((fixed, LINE[dtype]), (adaptive, LINE["adaptive"])):
-                if not rows:
-                    continue
-                label = name if rows is fixed else f"{name}, adaptive"
-                for axes, column in ((left, "run_seconds_min"), (right, "dt")):
-                    if axes is None or (axes is right and rows is adaptive):
-                        continue
-                    x, y = [r[column] for r in rows], [r["error_final_relative"] for r in rows]
-                    axes.loglog(x, y, style, marker="o", markersize=3, color=colour[method], linewidth=1.2)
-                    labels[axes].append((x[-1], y[-1], label, colour[method]))
-            if right is not None:
-                _limits(right, table, method, dtype, colour[method])
-    front = [r for r in table.rows if r["pareto"] and _drawable(r)]
-    left.loglog(
-        [r["run_seconds_min"] for r in front],
-        [r["error_final_relative"] for r in front],
-        "o",
-        markersize=9,
-        markerfacecolor="none",
-        markeredgecolor="0.3",
-        markeredgewidth=0.8,
-    )
-    left.set(xlabel="seconds for one run", ylabel="relative error at the end")
-    left.set_title("rings: no other run is both faster and more accurate", fontsize=9, color="0.3")
-    if right is not None:
-        right.set(xlabel="dt, s")
-        right.set_title("triangles: largest stable dt; level lines: roundoff floor", fontsize=9, color="0.3")
-        right.invert_xaxis()
-    for axes in (left, right):
-        if axes is not None:
-            axes.grid(True, which="major", color="0.9", linewidth=0.6)
-            axes.spines[["top", "right"]].set_visible(False)
-            label_ends(axes, labels[axes])
+        _, ax = plt.subplots(
+            len(dtypes), 2, figsize=(13, 5.2 * len(dtypes)), layout="constrained", sharey=True, squeeze=False
+        )
+        for pair, dtype in zip(ax, dtypes, strict=True):
+            _draw(pair, table, [dtype])
+            pair[0].set_title(f"{dtype}: rings mark runs that none beats in both time and error", fontsize=9)
+            pair[1].set_title(f"{dtype}: triangles, largest stable dt; dotted level, roundoff floor", fontsize=9)
+    else:
+        _draw(ax if isinstance(ax, (tuple, list, np.ndarray)) else (ax,), table, dtypes)
     return ax
 
 
+def _draw(axes: Any, table: Any, dtypes: list[str]) -> None:
+    methods = list(dict.fromkeys(row["method"] for row in table.rows))
+    colours = plt.get_cmap("tab10" if len(methods) <= 10 else "tab20")
+    labels: list[list] = [[] for _ in axes]
+    for index, method in enumerate(methods):
+        for dtype in dtypes:
+            own = [r for r in table.rows if (r["method"], r["dtype"]) == (method, dtype) and _drawable(r)]
+            name = method if len(dtypes) == 1 else f"{method}, {dtype}"
+            _lines(axes, own, name, colours(index), labels)
+            if len(axes) == 2:
+                _limits(axes[1], table, method, dtype, colours(index))
+    front = [r for r in table.rows if r["pareto"] and r["dtype"] in dtypes and _drawable(r)]
+    x, y = ([r[column] for r in front] for column in ("run_seconds_min", "error_final_relative"))
+    axes[0].loglog(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8)
+    axes[0].set(xlabel="seconds for one run", ylabel="relative error at the end")
+    if len(axes) == 2:
+        axes[1].set(xlabel="dt, s")
+        axes[1].invert_xaxis()
+    for each, own_labels in zip(axes, labels, strict=True):
+        each.grid(True, which="major", color="0.92", linewidth=0.6)
+        each.spines[["top", "right"]].set_visible(False)
+        label_ends(each, own_labels)
+
+
+def _lines(axes: Any, rows: list[dict], name: str, colour: Any, labels: list[list]) -> None:
+    """One method in one precision: its fixed steps as a line, its tolerances as a dotted one."""
+    fixed = sorted((r for r in rows if math.isfinite(r["dt"])), key=lambda r: -r["dt"])
+    adaptive = sorted((r for r in rows if math.isfinite(r["tolerance"])), key=lambda r: -r["tolerance"])
+    runs = [(0, fixed, "run_seconds_min", "-", name), (0, adaptive, "run_seconds_min", ":", f"{name}, adaptive")]
+    if len(axes) == 2:
+        runs.append((1, fixed, "dt", "-", name))
+    for place, own, column, style, label in runs:
+        if own:
+            x, y = [r[column] for r in own], [r["error_final_relative"] for r in own]
+            axes[place].loglog(x, y, style, marker="o", markersize=3, color=colour, linewidth=1.2)
+            labels[place].append((x[-1], y[-1], label, colour))
+
+
 def _drawable(row: dict) -> bool:
-    return row["error_final_relative"] > 0 and math.isfinite(row["error_final_relative"])
+    return 0 < row["error_final_relative"] < WORST
 
 
 def _limits(axes: Any, table: Any, method: str, dtype: str, colour: Any) -> None:
     """The roundoff floor and the stability limit of one method, if the sweep came near them."""
-    (summary,) = [s for s in table.summary if (s.method, s.dtype) == (method, dtype)]
-    size = [r["error_final"] / r["error_final_relative"] for r in table.rows if _drawable(r)]
+    summaries = [s for s in table.summary if (s.method, s.dtype) == (method, dtype)]
+    scales = [r["error_final_relative"] / r["error_final"] for r in table.rows if _drawable(r)]
     dts = [r["dt"] for r in table.rows if math.isfinite(r["dt"])]
-    if math.isfinite(summary.roundoff_floor) and size:
-        level = summary.roundoff_floor / size[0]
-        axes.hlines(level, min(dts), summary.floor_dt, color=colour, linewidth=0.8, linestyle=(0, (1, 2)))
-    if 0 < summary.stability_limit < math.inf and min(dts) / 4 < summary.stability_limit < max(dts) * 4:
-        transform = axes.get_xaxis_transform()
-        axes.plot(summary.stability_limit, 0.985, "v", color=colour, markersize=6, transform=transform, clip_on=False)
+    for summary in summaries:
+        if math.isfinite(summary.roundoff_floor) and scales:
+            level = summary.roundoff_floor * scales[0]
+            axes.hlines(level, min(dts), summary.floor_dt, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
+        if 0 < summary.stability_limit < math.inf and min(dts) / 4 < summary.stability_limit < max(dts) * 4:
+            where = axes.get_xaxis_transform()
+            axes.plot(summary.stability_limit, 0.985, "v", color=colour, markersize=6, transform=where, clip_on=False)
 
 
 def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
-    """Write each label to the right of its point, moved up or down until none covers another."""
-    axes.margins(x=0.03)
-    axes.figure.canvas.draw()
-    low, high = axes.get_xlim()
-    inverted = low > high
-    spread = (max(low, high) / min(low, high)) ** (0.42 if len(labels) > 8 else 0.3)
-    axes.set_xlim((low, high / spread) if inverted else (low, high * spread))
-    height = axes.get_window_extent().height
-    step = 11 * axes.figure.dpi / 72  # pixels a line of text takes
-    points = sorted(((*axes.transData.transform((x, y)), label, colour) for x, y, label, colour in labels), key=lambda p: p[1])
-    base = axes.get_window_extent().y0
-    placed: list[tuple[float, float]] = []
-    for x, y, label, colour in points:
-        at = min(max(y, base), base + height)
-        while any(abs(at - other) < step and abs(x - x_other) < 14 * step for x_other, other in placed):
-            at += step / 4
-        placed.append((x, at))
-        to_data = axes.transData.inverted().transform
+    """Write the labels in a column beside the axes, in the order of the points, each joined to its own by a thin line.
+
+    labels: x, y (data), text, colour.
+    """
+    axes.figure.draw_without_rendering()
+    low, high = axes.get_window_extent().y0, axes.get_window_extent().y1
+    line = min(13 * axes.figure.dpi / 72, (high - low) / max(1, len(labels)))
+    ends = sorted(((axes.transData.transform((x, y))[1], x, y, text, colour) for x, y, text, colour in labels))
+    heights = [max(end[0], low + line * i) for i, end in enumerate(ends)]
+    for i in range(1, len(heights)):
+        heights[i] = max(heights[i], heights[i - 1] + line)
+    top = high
+    for i in reversed(range(len(heights))):
+        top = heights[i] = min(heights[i], top)
+        top -= line
+    for height, (_, x, y, text, colour) in zip(heights, ends, strict=True):
         axes.annotate(
-            label,
-            xy=to_data((x, y)),
-            xytext=to_data((x + 10, at)),
+            text,
+            xy=(x, y),
+            xytext=(1.04, (height - low) / (high - low)),
+            textcoords="axes fraction",
             color=colour,
             fontsize=8,
             va="center",
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 1},
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.4, "alpha": 0.6, "shrinkA": 0, "shrinkB": 2},
         )
