@@ -28,16 +28,18 @@ def plot_work_precision(table: Any, ax: Any = None) -> Any:
         _, ax = plt.subplots(
             len(dtypes), 2, figsize=(13, 5.2 * len(dtypes)), layout="constrained", sharey=True, squeeze=False
         )
-        for pair, dtype in zip(ax, dtypes, strict=True):
-            _draw(pair, table, [dtype])
+        labels = [_draw(pair, table, [dtype]) for pair, dtype in zip(ax, dtypes, strict=True)]
+        for pair, own_labels, dtype in zip(ax, labels, dtypes, strict=True):
+            _finish(pair, own_labels)
             pair[0].set_title(f"{dtype}: rings mark runs that none beats in both time and error", fontsize=9)
             pair[1].set_title(f"{dtype}: triangles, largest stable dt; dotted level, roundoff floor", fontsize=9)
     else:
-        _draw(ax if isinstance(ax, (tuple, list, np.ndarray)) else (ax,), table, dtypes)
+        axes = ax if isinstance(ax, (tuple, list, np.ndarray)) else (ax,)
+        _finish(axes, _draw(axes, table, dtypes))
     return ax
 
 
-def _draw(axes: Any, table: Any, dtypes: list[str]) -> None:
+def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list]:
     methods = list(dict.fromkeys(row["method"] for row in table.rows))
     colours = plt.get_cmap("tab10" if len(methods) <= 10 else "tab20")
     labels: list[list] = [[] for _ in axes]
@@ -55,6 +57,11 @@ def _draw(axes: Any, table: Any, dtypes: list[str]) -> None:
     if len(axes) == 2:
         axes[1].set(xlabel="dt, s")
         axes[1].invert_xaxis()
+    return labels
+
+
+def _finish(axes: Any, labels: list[list]) -> None:
+    """What needs the final limits of the axes: the labels, last."""
     for each, own_labels in zip(axes, labels, strict=True):
         each.grid(True, which="major", color="0.92", linewidth=0.6)
         each.spines[["top", "right"]].set_visible(False)
@@ -119,5 +126,5 @@ def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
             fontsize=8,
             va="center",
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.4, "alpha": 0.6, "shrinkA": 0, "shrinkB": 2},
+            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.4, "alpha": 0.6, "shrinkA": 0, "relpos": (0, 0.5)},
         )
