@@ -118,9 +118,11 @@ class Linearisation:
         """The largest stable dt at a state, and the largest at which no stable mode grows beyond e within an interval."""
         rates, modes, matrix = self.eigen(t, flat)
         scale = np.abs(rates).max(initial=0.0)
-        if growing == "unstable" and np.any(rates.real > UNDAMPED * scale):
+        moving = np.abs(rates) > self.neutral * scale
+        grows = moving & (rates.real > UNDAMPED * scale)
+        if growing == "unstable" and grows.any():
             return 0.0, 0.0
-        counts = (np.abs(rates) > self.neutral * scale) & (rates.real <= UNDAMPED * scale)
+        counts = moving & ~grows
         if not counts.any():
             return math.inf, math.inf
         chosen = np.resize(np.flatnonzero(counts), rates.size)  # always as many, so that one program serves all states
