@@ -1,5 +1,23 @@
 """Figures and animations; the only room that imports matplotlib."""
 
+from jeuler.plotting.accuracy import plot_work_precision
 from jeuler.plotting.fit import plot_fit
+from jeuler.plotting.teaching import (
+    error_against_dt,
+    euler_polygon,
+    local_and_cumulative_error,
+    slope_field,
+    stability_regions,
+    step_sizes,
+)
 
-__all__ = ["plot_fit"]
+__all__ = [
+    "error_against_dt",
+    "euler_polygon",
+    "local_and_cumulative_error",
+    "plot_fit",
+    "plot_work_precision",
+    "slope_field",
+    "stability_regions",
+    "step_sizes",
+]

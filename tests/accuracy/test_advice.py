@@ -1,0 +1,120 @@
+"""advise_step on published problems: achieved error against target; refusals with reasons."""
+
+import json
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+from jeuler.accuracy import advise_step
+from jeuler.accuracy.pilot import Pilot
+
+NAMES = {name: getattr(jnp, name) for name in ("sin", "cos", "exp", "sqrt", "pi", "where", "floor", "sign")}
+NAMES |= {"range": range, "sum": sum, "abs": abs}
+FAST = [f"DETEST_nonstiff_{name}" for name in ("A1", "A3", "A4", "B1", "B3", "B5", "C1", "D1", "E2", "E5", "F1", "F5")]
+FAST += ["DETEST_stiff_B5", "DETEST_stiff_E2", "LORENZ_111_t10"]
+
+
+def published(shared, name):
+    with open(shared / "reference" / "ode_problems.json") as file:
+        (problem,) = [p for p in json.load(file)["problems"] if p["name"] == name]
+    right_side = eval("lambda t, y: " + problem["rhs"], NAMES)
+
+    def f(t, y, args):
+        return jnp.stack([jnp.asarray(part, y.dtype) for part in right_side(t, y)])
+
+    return f, jnp.array(problem["y0"], float), problem["t0"], problem["t1"], np.array(problem["reference"])
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_achieved_error_is_near_the_target_on_published_problems(shared, name):
+    f, y0, t0, t1, reference = published(shared, name)
+    run = Pilot(f, y0, t0, t1, None, jeuler.euler_step, np.float64, False)
+    for target in (1e-1, 1e-3):
+        advice = advise_step(f, y0, t0=t0, t1=t1, error=target)
+        assert advice.feasible, advice.reason
+        assert advice.dt * advice.num_steps == pytest.approx(t1 - t0)
+        if advice.num_steps > 4_000_000:
+            continue
+        error = np.linalg.norm(run(advice.num_steps)[-1] - reference) / np.linalg.norm(reference)
+        assert error == pytest.approx(advice.predicted_error, rel=0.35)
+        assert error < 1.2 * target
+        assert error > target / 6  # the least: stability sets the step
+
+
+@pytest.mark.parametrize("step", [jeuler.heun_step, jeuler.rk4_step])
+def test_other_steps_are_advised_too(step):
+    oscillator = lambda t, y, args: (y[1], -4 * y[0])  # noqa: E731
+    for target in (1e-2, 1e-5):
+        advice = advise_step(oscillator, (1.0, 0.0), t1=5.0, error=target, step=step)
+        run = jeuler.solve(oscillator, (1.0, 0.0), dt=advice.dt, num_steps=advice.num_steps, step=step)
+        exact = np.array([math.cos(10), -2 * math.sin(10)])
+        error = np.hypot(run.y[0][-1] - exact[0], run.y[1][-1] - exact[1]) / np.linalg.norm(exact)
+        assert target / 3 < error < target
+
+
+def test_symplectic_step_and_absolute_error():
+    field = lambda t, y, ks: (y[1], -ks * y[0])  # noqa: E731
+    y0 = jnp.array(100.0), jnp.array(0.0)
+    advice = advise_step(field, y0, t1=3.0, error=0.5, args=9.0, step=jeuler.symplectic_euler_step, relative=False)
+    assert advice.stability_limit == pytest.approx(2 / 3, rel=1e-3)
+    run = jeuler.solve(
+        field, y0, dt=advice.dt, num_steps=advice.num_steps, args=9.0, step=jeuler.symplectic_euler_step
+    )
+    error = math.hypot(run.y[0][-1] - 100 * math.cos(9), run.y[1][-1] + 300 * math.sin(9))
+    assert 0.5 / 3 < error < 0.5
+
+
+def test_stability_bounds_the_step_and_is_named():
+    stiff = lambda t, y, args: -1000.0 * (y - jnp.cos(t))  # noqa: E731
+    advice = advise_step(stiff, 1.0, t1=1.0, error=0.1)
+    assert advice.feasible
+    assert advice.stability_limit == pytest.approx(0.002)
+    assert advice.dt <= 0.002 * 1.01
+    assert "stability" in advice.reason
+    assert advice.predicted_error < 0.1
+
+
+def test_it_refuses_below_the_roundoff_floor_of_float32_and_names_what_could():
+    y0, field = jnp.float32(1.0), lambda t, y, args: -y
+    advice = advise_step(field, y0, t1=1.0, error=1e-9)
+    assert not advice.feasible
+    assert math.isnan(advice.dt)
+    assert "roundoff" in advice.reason
+    assert "float64" in advice.reason
+    assert "compensated=True" in advice.reason
+    run = [
+        abs(float(jeuler.solve(field, y0, dt=1 / n, num_steps=n, save_every=n).y[-1]) * math.e - 1)
+        for n in (2**14, 2**16, 2**18)
+    ]
+    assert advice.roundoff_floor / 30 < min(run) < advice.roundoff_floor * 30
+    better = advise_step(field, y0, t1=1.0, error=1e-6, compensated=True)
+    assert better.feasible
+    run = jeuler.solve(field, y0, dt=better.dt, num_steps=better.num_steps, compensated=True, save_every=better.num_steps)
+    assert abs(float(run.y[-1]) * math.e - 1) < 1.3e-6
+
+
+def test_it_refuses_what_it_cannot_look_into(shared):
+    f, y0, t0, t1, _ = published(shared, "MAZZIA_ROBER")
+    advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2)
+    assert not advice.feasible
+    assert "implicit_euler_step" in advice.reason
+    jumpy = lambda t, y, args: jnp.where(jnp.sin(1e6 * t * t) > 0, 50.0, -49.0)  # noqa: E731
+    advice = advise_step(jumpy, 1.0, t1=1.0, error=1e-6, max_pilot_steps=4096)
+    assert not advice.feasible
+    assert "max_pilot_steps" in advice.reason
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"t1": 0.0}, "t1 must be later than t0=0"),
+        ({"error": 0.0}, "error must be greater than 0"),
+        ({"max_pilot_steps": 1}, "max_pilot_steps must be at least 64"),
+    ],
+)
+def test_bad_input_is_told(change, message):
+    with pytest.raises(ValueError, match=message):
+        advise_step(lambda t, y, args: -y, 1.0, **({"t1": 1.0, "error": 1e-2} | change))
