@@ -52,7 +52,7 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
 
 def as_float(x: ArrayLike | None) -> Array | None:
     """A parameter as a floating array; Python numbers stay weakly typed, so they follow the state's dtype."""
-    if x is None or (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact)):
+    if x is None or isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact):
         return x
     if isinstance(x, (bool, int, float)):
         return jnp.asarray(float(x))

@@ -141,3 +141,14 @@ class Box(_Shape):
         q = jnp.abs(point - _place(self.center, t, point)) - self.half_size.astype(point.dtype)
         deepest = jnp.max(q)
         return jnp.where(deepest > 0, length(jnp.maximum(q, 0)), deepest)
+
+
+def check_collider(collider: Any, dim: int) -> None:
+    """One ValueError where a collider does not fit the dimension of the positions."""
+    if not callable(collider):
+        raise ValueError(f"a collider must be a Plane, Sphere, Box or a function (t, point) -> (), got {collider!r}")
+    if hasattr(collider, "check"):
+        collider.check(dim)
+    shape = jnp.shape(jax.eval_shape(collider, jnp.zeros(()), jnp.zeros(dim)))
+    if shape != ():
+        raise ValueError(f"a collider must return one signed distance, shape (), for a point, got {shape}")

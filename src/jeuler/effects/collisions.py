@@ -12,7 +12,7 @@ from jax import Array, lax
 
 from jeuler import _check, _tree
 from jeuler._root import root
-from jeuler.colliders import Collider, length, normal_and_speed, unit
+from jeuler.colliders import Collider, check_collider, length, normal_and_speed, unit
 
 MAX_STRIDES = 100  # along one path; a path that grazes a surface needs many
 NEWTON_STEPS = 5
@@ -114,11 +114,7 @@ class Collisions:
             if shape not in shapes:
                 raise ValueError(f"Collisions.{name} must have shape {' or '.join(map(str, shapes))}, got {shape}")
         for collider in self.colliders:
-            if hasattr(collider, "check"):
-                collider.check(dim)
-            shape = jax.eval_shape(collider, jnp.zeros(()), jnp.zeros(dim)).shape
-            if shape != ():
-                raise ValueError(f"a collider must return one signed distance, shape (), for a point, got {shape}")
+            check_collider(collider, dim)
 
 
 def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
