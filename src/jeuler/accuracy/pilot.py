@@ -1,0 +1,99 @@
+"""Pilot runs: the final state for any number of steps from one compiled program, and what a ladder of them says."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jeuler._precision import cast, flat_rows, precision
+from jeuler.methods import Step, VectorField
+from jeuler.solve import advance_by, no_loss
+
+PyTree = Any
+SAMPLES = 8  # states kept of a pilot run, at which its stability is looked at
+
+
+class Pilot:
+    """Runs of one step on one problem; the number of steps is an input of the program, not a part of it."""
+
+    def __init__(
+        self, f: VectorField, y0: PyTree, t0: float, t1: float, args: PyTree, step: Step, dtype: Any, compensated: bool
+    ) -> None:
+        self.dtype, self.interval = dtype, t1 - t0
+        advance = advance_by(step, compensated=compensated)
+
+        def run(y0, args, t0, dt, ends):
+            def one_step(n, state):
+                return advance(f, t0 + n.astype(dt.dtype) * dt, state, dt, args)
+
+            def segment(carry, end):
+                begin, state = carry
+                state = lax.fori_loop(begin, end, one_step, state)
+                return (end, state), state[0]
+
+            start = jnp.int32(0), (y0, no_loss(y0, compensated))
+            return lax.scan(segment, start, ends)[1]
+
+        with precision(dtype):
+            inputs = cast(y0, dtype), cast(args, dtype), jnp.asarray(t0, dtype)
+            self.program = functools.partial(jax.jit(run), *inputs)
+
+    def __call__(self, num_steps: int) -> np.ndarray:
+        """States at the ends of eight parts of the interval: (part, number), the last one at t1."""
+        with precision(self.dtype):
+            ends = jnp.asarray(np.arange(1, SAMPLES + 1) * num_steps // SAMPLES, jnp.int32)
+            dt = jnp.asarray(self.interval / num_steps, self.dtype)
+            return flat_rows(self.program(dt, ends))
+
+
+@dataclasses.dataclass
+class Ladder:
+    """Final states for numbers of steps that double, and their extrapolation to dt = 0 (Richardson, Aitken-Neville).
+
+    T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (2^(p+m-1) - 1),  p the order of the step
+    """
+
+    order: int
+    num_steps: list[int] = dataclasses.field(default_factory=list)
+    finals: list[np.ndarray] = dataclasses.field(default_factory=list)
+    best: np.ndarray | None = None  # the extrapolated state at t1
+    doubt: float = np.inf  # norm of its last change: how far it may be trusted
+
+    def add(self, num_steps: int, final: np.ndarray) -> None:
+        self.num_steps.append(num_steps)
+        self.finals.append(final)
+        if not np.all(np.isfinite(final)):  # what was before an unstable run says nothing
+            self.num_steps.clear()
+            self.finals.clear()
+        self._extrapolate()
+
+    def _extrapolate(self) -> None:
+        self.best, self.doubt = None, np.inf
+        column = self.finals[-6:]
+        for m in range(min(5, len(column) - 1)):
+            factor = 2.0 ** (self.order + m) - 1
+            finer = [b + (b - a) / factor for a, b in zip(column, column[1:], strict=False)]
+            # two entries of the new column must agree, or one new entry be near the column before
+            change = np.linalg.norm(finer[-1] - (finer[-2] if len(finer) > 1 else column[-1]))
+            if change < self.doubt:
+                self.best, self.doubt = finer[-1], float(change)
+            column = finer
+
+    def errors(self) -> np.ndarray:
+        """Norm of each final state's difference from the extrapolated one."""
+        if self.best is None:
+            return np.full(len(self.finals), np.inf)
+        return np.array([np.linalg.norm(final - self.best) for final in self.finals])
+
+    def observed_orders(self) -> np.ndarray:
+        """log2 of the ratio of the errors of neighbours."""
+        errors = np.maximum(self.errors(), 1e-300)
+        return np.log2(errors[:-1] / errors[1:])
+
+

@@ -1,0 +1,128 @@
+"""What errors are measured against: an exact solution, a given one, or an accurate solver; always in float64."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler._precision import flat, flat_rows
+from jeuler.methods import VectorField
+
+PyTree = Any
+TOLERANCES = 1e-11, 1e-13  # relative and, times the size of y0, absolute; the second is the reference
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """States to compare with.
+
+    Attributes:
+      times: (time,), s.
+      states: (time, number), the numbers of y in one row each; NaN where nothing is known.
+      error: how far the states may be trusted: the norm of the last one's change from the looser tolerance; 0.0 for
+        an exact or a given reference.
+    """
+
+    times: np.ndarray
+    states: np.ndarray
+    error: float
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        return self.states[np.searchsorted(self.times, times - 1e-9 * (self.times[-1] - self.times[0]))]
+
+
+def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, times: np.ndarray) -> Reference:
+    """The reference at sorted times; y0 and args in float64.
+
+    reference: a function of t, the state at the last time, a diffrax solver, or None for ``diffrax.Dopri8``.
+    """
+    import diffrax
+
+    if reference is None or isinstance(reference, diffrax.AbstractSolver):
+        solver = diffrax.Dopri8() if reference is None else reference
+        run = jax.jit(lambda tolerance: accurate(f, y0, args, times, solver, tolerance))
+        loose, tight = (flat_rows(run(tolerance)) for tolerance in TOLERANCES)
+        if not np.all(np.isfinite(tight)):
+            raise ValueError(
+                f"reference must be finite, got NaN or inf from {type(solver).__name__} at tolerance {TOLERANCES[1]}; give "
+                f"an exact solution as a function of t, or a stiff solver such as diffrax.Kvaerno5()"
+            )
+        return Reference(times, tight, float(np.linalg.norm(tight[-1] - loose[-1])))
+    if callable(reference):
+        states = np.stack([flat(reference(t)) for t in times])
+    else:
+        final = flat(reference)
+        states = np.full((len(times), final.size), np.nan)
+        states[0], states[-1] = flat(y0) if final.size == flat(y0).size else np.nan, final
+    if states.shape[1] != flat(y0).size:
+        raise ValueError(
+            f"reference must have the numbers of y0, {flat(y0).size}, got {states.shape[1]}; give a function of t that "
+            f"returns a state, or the state at t1"
+        )
+    return Reference(times, states, 0.0)
+
+
+def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, tolerance: Any) -> PyTree:
+    """States at the times by an adaptive diffrax solver that steps exactly to each of them. Differentiable."""
+    import diffrax
+
+    control = diffrax.PIDController(rtol=tolerance, atol=tolerance * max(np.linalg.norm(flat(y0)), 1e-3))
+    if len(times) > 2:
+        control = diffrax.ClipStepSizeController(control, step_ts=jnp.asarray(times))
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(f),
+        solver,
+        float(times[0]),
+        float(times[-1]),
+        None,
+        y0,
+        args,
+        saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
+        stepsize_controller=control,
+        max_steps=1_000_000,
+        throw=False,
+    ).ys
+
+
+@dataclasses.dataclass(frozen=True)
+class ReferenceGradient:
+    """The derivative of a scalar of the final state with respect to args, as one vector, and its trust."""
+
+    value: np.ndarray
+    error: float
+
+
+def make_reference_gradient(
+    scalar: Callable, reference: Any, f: VectorField, y0: PyTree, args: PyTree, t0: float, t1: float
+) -> ReferenceGradient:
+    """By reverse mode through the accurate solver at two tolerances."""
+    import diffrax
+
+    solver = reference if isinstance(reference, diffrax.AbstractSolver) else diffrax.Dopri8()
+
+    def final(args, tolerance):
+        states = accurate(f, y0, args, np.array([t0, t1]), solver, tolerance)
+        return scalar(jax.tree.map(lambda leaf: leaf[-1], states))
+
+    gradient = jax.jit(jax.grad(final))
+    loose, tight = (flat(gradient(args, tolerance)) for tolerance in TOLERANCES)
+    return ReferenceGradient(tight, float(np.linalg.norm(tight - loose)))
+
+
+def error_norms(states: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Euclidean norms of the error over all numbers of the state: at the end, largest, and root mean square in time."""
+    error, size = np.linalg.norm(states - reference, axis=1), np.linalg.norm(reference, axis=1)
+    weights = np.ones(len(error))
+    weights[[0, -1]] = 0.5  # the trapezoidal rule on even times
+    mean_square = lambda x: float(np.sqrt(np.sum(weights * x**2) / np.sum(weights)))  # noqa: E731
+    absolute = {"final": float(error[-1]), "max": float(error.max()), "l2": mean_square(error)}
+    scale = {"final": float(size[-1]), "max": float(size.max()), "l2": mean_square(size)}
+    norms = {f"error_{name}": value for name, value in absolute.items()}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        norms |= {f"error_{name}_relative": float(np.divide(absolute[name], scale[name])) for name in absolute}
+    return norms

@@ -1,0 +1,81 @@
+"""Seconds and bytes of a program: compilation apart, every repeat kept."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurement:
+    """What a program cost.
+
+    Attributes:
+      result: what it returned.
+      compile_seconds: tracing, lowering and compiling it.
+      run_seconds: each repeat, first run excluded, in the order measured; waits for the result.
+      temporary_bytes: peak memory beside inputs and outputs, as the compiler planned it; -1 if it does not say.
+    """
+
+    result: Any
+    compile_seconds: float
+    run_seconds: tuple[float, ...]
+    temporary_bytes: int
+
+    @property
+    def least(self) -> float:
+        return min(self.run_seconds)
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.run_seconds))
+
+
+def measure(
+    function: Callable, *inputs: Any, repeats: int = 5, budget: float = 1.0, patience: float = float("inf")
+) -> Measurement:
+    """Compile function for these inputs, run it once unmeasured, then ``repeats`` times measured.
+
+    Fewer times, but at least once, where they would take more than ``budget`` seconds together. A first run longer
+    than ``patience`` seconds is the only one, and is itself the measurement.
+    """
+    begun = time.perf_counter()
+    compiled = jax.jit(function).lower(*inputs).compile()
+    compile_seconds = time.perf_counter() - begun
+
+    def once() -> tuple[float, Any]:
+        begun = time.perf_counter()
+        result = jax.block_until_ready(compiled(*inputs))
+        return time.perf_counter() - begun, result
+
+    first, result = once()  # carries one-time costs: pages, threads, caches
+    repeats = max(1, min(repeats, int(budget / first)))
+    runs = (first,) if first > patience else tuple(once()[0] for _ in range(repeats))
+    memory = compiled.memory_analysis()
+    return Measurement(result, compile_seconds, runs, getattr(memory, "temp_size_in_bytes", -1))
+
+
+def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
+    """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and reset it."""
+    count = 0
+
+    def add_one(_: Any) -> None:
+        nonlocal count
+        count += 1
+
+    def counted(t, y, args):
+        jax.debug.callback(add_one, (t, jax.tree.leaves(y)))  # depends on all, so that vmap calls it once a member
+        return f(t, y, args)
+
+    def read() -> int:
+        nonlocal count
+        jax.effects_barrier()
+        counted_so_far, count = count, 0
+        return counted_so_far
+
+    return counted, read

@@ -1,0 +1,307 @@
+"""The largest stable step size: the spectrum of the vector field under the amplification of the step."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from jeuler import _check, _tree
+from jeuler._precision import cast, double_precision
+from jeuler.methods import Step, VectorField, euler_step
+
+PyTree = Any
+
+DENSE = 512  # numbers in the state up to which all eigenvalues are computed
+NEUTRAL = 4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
+UNDAMPED = 1e-10  # |real part| below this part of the largest eigenvalue is zero up to roundoff
+ROUNDOFF = 1e-15  # |R| - 1 below this is 0
+EXTREMES = 8  # eigenvalues asked for at each end of a large spectrum
+
+
+def stability_limit(
+    f: VectorField,
+    t: Any,
+    y: PyTree,
+    args: Any = None,
+    *,
+    step: Step = euler_step,
+    growing: Literal["unstable", "skip"] = "unstable",
+) -> float:
+    """The largest stable dt of a step at one state: what is perturbed there does not grow.
+
+        |R(dt lambda)| <= 1 for every eigenvalue lambda of df/dy (t, y)
+
+    R, the amplification of the step on y' = lambda y, is found by applying the step itself to that problem, so any
+    step has a limit: explicit, implicit, or one of your own. A step on pairs (position, velocity) that treats the two
+    differently, such as `symplectic_euler_step`, is applied to x'' = -k x - c x' instead, one (k, c) a mode.
+
+    Explicit Euler: dt <= -2 Re(lambda) / |lambda|^2, so 2 z / omega for an oscillator of damping ratio z < 1, and 0
+    without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no limit, inf.
+
+    The limit belongs to the state: look at it where the system is stiffest. Eigenvalues that are 0
+    up to the roundoff of the data (a system that can drift) do not count. Up to 512 numbers in the state all eigenvalues are computed; above, Arnoldi iteration on
+    Jacobian-vector products finds those of the largest modulus, real part and imaginary part, and the limit is that
+    of these. Computed in float64 on the host, so it is not for use under jit.
+
+    Args:
+      f: vector field, ``f(t, y, args) -> dy/dt``.
+      t: time, s.
+      y: state, any pytree of floating or complex arrays.
+      args: passed to f.
+      step: the method.
+      growing: "unstable": where the equation itself grows (Re lambda > 0) no dt is stable, 0.0; "skip": the growth is
+        the solution's own and only the other eigenvalues count.
+    Returns: the limit, s, a float; 0.0 when no dt is stable, inf when every dt is.
+    Raises: ValueError if y or t is traced, if f does not return the form of y, or if its Jacobian is not finite.
+    Example:
+      >>> import jeuler
+      >>> oscillator = lambda t, y, ks: (y[1], -ks * y[0])
+      >>> jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0)
+      0.0
+      >>> round(jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0, step=jeuler.symplectic_euler_step), 6)
+      0.4
+      >>> round(jeuler.stability_limit(lambda t, y, args: -50.0 * y, 0.0, 1.0), 6)
+      0.04
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.2; W. E. Arnoldi, The
+      principle of minimized iterations, Q. Appl. Math. 9, 1951.
+    """
+    if growing not in ("unstable", "skip"):
+        raise ValueError(f'growing must be "unstable" or "skip", got {growing!r}')
+    if any(map(_check.is_traced, jax.tree.leaves((t, y, args)))):
+        raise ValueError("stability_limit must be called with values, got traced ones; call it outside jit, grad, vmap")
+    _check.number("t", t)
+    y = _check.state("y", y)
+    _check.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
+    with double_precision():
+        linear = Linearisation(f, y, args)
+        return linear.limits(t, linear.flat, step, growing=growing)[0]
+
+
+class Linearisation:
+    """The linear field J u around states of one form: as products, as a matrix where it is small, by its modes."""
+
+    def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
+        self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # of the precision of the data
+        y, args = cast(y, np.float64), cast(args, np.float64)
+        leaves, structure = jax.tree.flatten(y)
+        split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
+        self.complex = any(isinstance(part, tuple) for part in split)
+        self.flat, restore = ravel_pytree(split)  # complex numbers as pairs of real ones
+
+        def unflatten(flat):
+            parts = [jax.lax.complex(*part) if isinstance(part, tuple) else part for part in restore(flat)]
+            return jax.tree.unflatten(structure, parts)
+
+        def real_field(t, flat):
+            slopes = structure.flatten_up_to(f(t, unflatten(flat), args))
+            pairs = zip(slopes, split, strict=True)
+            parts = [(jnp.real(s), jnp.imag(s)) if isinstance(part, tuple) else s for s, part in pairs]
+            return ravel_pytree(parts)[0].astype(flat.dtype)
+
+        def product(t, flat, u):
+            return jax.jvp(lambda flat: real_field(t, flat), (flat,), (u,))[1]
+
+        self.unflatten = unflatten
+        self.product = jax.jit(product)
+        self.products = jax.jit(jax.vmap(product, in_axes=(None, None, 1), out_axes=1))
+
+    def limits(
+        self, t: Any, flat: Any, step: Step, *, growing: str = "skip", interval: float = math.inf
+    ) -> tuple[float, float]:
+        """The largest stable dt at a state, and the largest at which no stable mode grows beyond e within an interval."""
+        rates, modes, matrix = self.eigen(t, flat)
+        scale = np.abs(rates).max(initial=0.0)
+        if growing == "unstable" and np.any(rates.real > UNDAMPED * scale):
+            return 0.0, 0.0
+        counts = (np.abs(rates) > self.neutral * scale) & (rates.real <= UNDAMPED * scale)
+        if not counts.any():
+            return math.inf, math.inf
+        chosen = np.resize(np.flatnonzero(counts), rates.size)  # always as many, so that one program serves all states
+        rates, modes = rates[chosen], modes[:, chosen]
+        rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
+        if treats_all_alike(step):
+            limit = float(np.min(scalar_limits(step, rates)))
+            bound = limit if math.isinf(interval) else float(np.min(scalar_limits(step, rates, interval)))
+            return limit, max(limit, bound)
+        stiffness, damping = self.modal(t, flat, rates, modes)
+        limit = float(np.min(pair_limits(step, stiffness, damping)))
+        bound = limit if math.isinf(interval) else float(np.min(pair_limits(step, stiffness, damping, interval)))
+        return (limit if matrix is None else self.refined(step, matrix, limit)), max(limit, bound)
+
+    def eigen(self, t: Any, flat: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is small."""
+        n = self.flat.size
+        matrix = np.asarray(self.products(t, flat, jnp.eye(n))) if n <= DENSE else None
+        if not np.all(np.isfinite(self.product(t, flat, jnp.ones(n)) if matrix is None else matrix)):
+            raise ValueError(
+                "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; give a state at which f is smooth"
+            )
+        if matrix is not None:
+            rates, modes = np.linalg.eig(matrix)
+            return rates.astype(complex), modes.astype(complex), matrix
+        from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
+
+        operator = LinearOperator(
+            (n, n), matvec=lambda u: np.asarray(self.product(t, flat, jnp.asarray(u).ravel())), dtype=float
+        )
+        start = np.random.default_rng(0).standard_normal(n)
+        found = []
+        for which in ("LM", "LR", "LI"):
+            try:
+                found.append(eigs(operator, k=EXTREMES, which=which, v0=start, tol=1e-6, maxiter=20 * EXTREMES))
+            except ArpackNoConvergence as partial:
+                found.append((partial.eigenvalues, partial.eigenvectors))
+        return np.concatenate([r for r, _ in found]), np.concatenate([v for _, v in found], axis=1), None
+
+    def modal(self, t: Any, flat: Any, rates: np.ndarray, modes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Stiffness k and damping c of each mode of a second-order system, from its shape.
+
+        lambda^2 x = A x + lambda B x  =>  k = -x* A x / x* x,  c = -x* B x / x* x
+        """
+        half = self.flat.size // 2
+        shape = modes[half:]
+        still = np.zeros_like(shape)
+
+        def quotient(direction):
+            real, imaginary = (self.products(t, flat, jnp.asarray(part)) for part in (direction.real, direction.imag))
+            image = np.asarray(real)[half:] + 1j * np.asarray(imaginary)[half:]
+            return (-np.sum(shape.conj() * image, axis=0) / np.sum(np.abs(shape) ** 2, axis=0)).real
+
+        stiffness = quotient(np.concatenate([shape, still]))
+        damping = quotient(np.concatenate([still, shape]))
+        return stiffness, np.where(rates.real == 0, 0.0, damping)
+
+    def refined(self, step: Step, matrix: np.ndarray, limit: float) -> float:
+        """The limit by bisection on the spectral radius of the whole step, where the system is small enough.
+
+        Exact also where damping couples the modes, which the modal limit is not.
+        """
+        if not 0 < limit < math.inf or self.flat.size > DENSE // 4 or self.complex:
+            return limit
+
+        def linear(t, y, matrix):
+            return self.unflatten(matrix @ ravel_pytree(y)[0])
+
+        @jax.jit
+        def image(dt):
+            columns = jax.vmap(lambda u: ravel_pytree(step(linear, 0.0, self.unflatten(u), dt, matrix))[0])
+            return columns(jnp.eye(len(matrix))).T
+
+        def stable(dt):
+            return np.abs(np.linalg.eigvals(np.asarray(image(dt)))).max() <= 1 + 1e-6
+
+        low, high = limit / 4, limit * 2
+        if not stable(low) or stable(high):
+            return limit
+        for _ in range(24):
+            middle = (low + high) / 2
+            low, high = (middle, high) if stable(middle) else (low, middle)
+        return low
+
+
+def amplification(step: Step, z: jax.Array) -> jax.Array:
+    """|R(z)|: what one step of size 1 does to y' = z y, the complex z written as a real 2 x 2 matrix."""
+    matrix = jnp.array([[z.real, -z.imag], [z.imag, z.real]])
+    image = step(lambda t, u, a: a @ u, 0.0, jnp.array([1.0, 0.0]), 1.0, matrix)
+    return jnp.hypot(image[0], image[1])
+
+
+def pair_amplification(step: Step, stiffness: jax.Array, damping: jax.Array) -> jax.Array:
+    """Spectral radius of one step of size 1 on x'' = -k x - c x'."""
+
+    def field(t, y, args):
+        return y[1], -stiffness * y[0] - damping * y[1]
+
+    (a, c), (b, d) = (step(field, 0.0, start, 1.0, None) for start in _unit_pairs())
+    mean, determinant = (a + d) / 2, a * d - b * c
+    square = mean**2 - determinant
+    return jnp.where(
+        square > 0, jnp.abs(mean) + jnp.sqrt(jnp.maximum(square, 0)), jnp.sqrt(jnp.abs(determinant))
+    )
+
+
+@functools.partial(jax.jit, static_argnames="step")
+def _scalar_gain(step, unit, s):
+    return jax.vmap(jax.vmap(lambda z: amplification(step, z)))(unit[:, None] * s)
+
+
+@functools.partial(jax.jit, static_argnames="step")
+def _pair_gain(step, stiffness, damping, s):
+    gain = jax.vmap(jax.vmap(lambda k, c: pair_amplification(step, k, c)))
+    return gain(stiffness[:, None] * s**2, damping[:, None] * s)
+
+
+def _unit_pairs():
+    one, zero = jnp.float64(1.0), jnp.float64(0.0)
+    return (one, zero), (zero, one)
+
+
+@functools.lru_cache(maxsize=64)
+def treats_all_alike(step: Step) -> bool:
+    """Whether the step commutes with a linear change of variables, so that eigenvalues say all about it."""
+
+    @jax.jit
+    def image(matrix):
+        def field(t, y, args):
+            return matrix[0, 0] * y[0] + matrix[0, 1] * y[1], matrix[1, 0] * y[0] + matrix[1, 1] * y[1]
+
+        return jnp.array([step(field, 0.0, start, 1.0, None) for start in _unit_pairs()]).T
+
+    with double_precision():
+        field = np.array([[0.1, 0.7], [-0.4, -0.3]])
+        change = np.array([[1.0, 0.5], [-0.3, 0.8]])
+        other = change @ image(np.linalg.solve(change, field @ change)) @ np.linalg.inv(change)
+        return bool(np.allclose(image(field), other, rtol=1e-4, atol=1e-4))
+
+
+def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> np.ndarray:
+    """The largest stable dt of each eigenvalue, Re <= 0."""
+    size = np.abs(rates)
+    return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
+
+
+def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf) -> np.ndarray:
+    """The largest stable dt of each mode x'' = -k x - c x'."""
+    size = np.sqrt(np.abs(stiffness)) + np.abs(damping)
+    gain = functools.partial(_pair_gain, step, stiffness / size**2, damping / size)
+    return largest_stable(gain, 1 / (size * interval)) / size
+
+
+def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
+    """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if endless.
+
+    gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|, (mode,).
+    """
+    points, lasting = 801, 25  # 50 points a decade; a gain above 1 over half a decade is not the noise of a solve
+    modes = len(growth)
+    s = np.broadcast_to(np.logspace(-8, 8, points), (modes, points))
+
+    def excess(s):
+        above = np.asarray(gain(s)) - 1 - growth[:, None] * s
+        return np.where(np.isfinite(above), above, np.inf)
+
+    above = excess(s)
+    unstable = above > ROUNDOFF
+    lasts = np.stack([unstable[:, k : points - lasting + k] for k in range(lasting)]).all(0)
+    first = lasts.argmax(1)
+    limits = np.where(lasts.any(1), 0.0, np.inf)
+    for mode in np.flatnonzero(lasts.any(1) & (first > 0)):
+        # growth as s^2 or s^4 is below roundoff at small s: an interval without decay counts only if it is long
+        decay = above[mode, : first[mode]].min()
+        if decay < -4 * ROUNDOFF or s[mode, first[mode]] > 0.05:
+            limits[mode] = s[mode, first[mode]]
+    found = (limits > 0) & np.isfinite(limits)
+    low, high = (np.where(found, s[range(modes), np.maximum(first - k, 0)], 1.0) for k in (1, 0))
+    for _ in range(3 if found.any() else 0):  # three times a grid of 801 points between the last two
+        s = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
+        unstable = excess(s) > ROUNDOFF
+        first = np.maximum(unstable.argmax(1), 1)
+        low, high = s[range(modes), first - 1], s[range(modes), first]
+    return np.where(found, low, limits)
