@@ -35,7 +35,7 @@ def implicit_euler(
     *,
     rtol: float | None = None,
     atol: float | None = None,
-    max_steps: int = 20,
+    max_steps: int = 50,
     linear_solver: Any = None,
 ) -> Step:
     """Make a backward (implicit) Euler step with these tolerances.
@@ -58,7 +58,7 @@ def implicit_euler(
     Raises: ValueError, if a tolerance is not positive or max_steps is below 1.
     Example:
       >>> import jeuler
-      >>> step = jeuler.implicit_euler(max_steps=50)
+      >>> step = jeuler.implicit_euler(max_steps=100)
       >>> round(float(step(lambda t, y, args: -1e6 * (y - t), 0.0, 1.0, 0.1, None)), 4)
       0.1
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8.

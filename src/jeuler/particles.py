@@ -89,7 +89,8 @@ class Scene:
     Args:
       forces: functions ``(t, position, velocity, mass) -> (particle, dim)`` in N, such as `Springs` and `Gravity`.
       effects: functions ``(t, dt, state, key) -> state``, applied after each step in this order, such as
-        `PrescribedMotion`.
+        `PrescribedMotion`. One that needs the state before the step, such as `Collisions`, has a method
+        ``over_step(t, dt, previous, state, key)``, which is called instead.
     Raises: ValueError, in `simulate`, where a force or effect does not fit the state.
     Example:
       >>> import jax, jeuler
@@ -218,13 +219,18 @@ def simulate(
     advance = advance_by(step, compensated=compensated)
 
     def next_state(n, t, state_and_lost):
-        state, lost = state_and_lost
+        previous, lost = state_and_lost
+        state = previous
         motion = state.position, state.velocity
         (position, velocity), lost = advance(field, t, (motion, lost), grid.dt, state.mass)
         state = _tree.replace(state, position=position, velocity=velocity)
         for index, effect in enumerate(scene.effects):
             own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, n), index)
-            state = effect(grid.clock(n + 1), grid.dt, state, own_key)
+            now = grid.clock(n + 1), grid.dt
+            if hasattr(effect, "over_step"):
+                state = effect.over_step(*now, previous, state, own_key)
+            else:
+                state = effect(*now, state, own_key)
         return state, lost
 
     start = state, no_loss(motion, compensated)

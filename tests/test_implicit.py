@@ -1,0 +1,236 @@
+"""Implicit steps: the values of exact solutions, derivatives in every mode, stiff problems, the stiff cloth."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hard_scenes import cloth, cloth_scene
+
+import jeuler
+from jeuler.implicit import implicit_euler, implicit_euler_step, linearly_implicit_euler_step
+
+STEPS = [implicit_euler_step, linearly_implicit_euler_step]
+BY_NAME = pytest.mark.parametrize("step", STEPS, ids=lambda step: step.__name__)
+
+
+def stiff_field(t, y, a):
+    return -a * (y**3 - jnp.cos(t))
+
+
+def stiff_end(step, num_steps=10):
+    def end(a):
+        y0 = jnp.array([1.0, 2.0])
+        solution = jeuler.solve(stiff_field, y0, dt=0.1, num_steps=num_steps, args=a, step=step)
+        return jnp.sum(solution.y[-1] ** 2)
+
+    return jax.jit(end)
+
+
+@BY_NAME
+def test_linear_system_equals_matrix_solve(step):
+    matrix = jnp.array([[-3.0, 2.0, 0.0], [1.0, -1000.0, 5.0], [0.0, 7.0, -2.0]])
+    y = jnp.array([1.0, -2.0, 3.0])
+    end = step(lambda t, y, args: matrix @ y + t, 0.5, y, 0.25, None)
+    np.testing.assert_allclose(end, np.linalg.solve(np.eye(3) - 0.25 * matrix, y + 0.25 * 0.75), rtol=1e-12)
+
+
+@BY_NAME
+def test_pair_is_reduced_to_velocity_with_the_same_result(step):
+    """(position, velocity) as a pair and as one vector: two ways to solve one equation."""
+
+    def pair(t, y, k):
+        return y[1], -k * y[0] ** 3 - 0.1 * y[1] * jnp.abs(y[0])
+
+    def vector(t, y, k):
+        return jnp.stack(pair(t, (y[0], y[1]), k))
+
+    x, v = step(pair, 0.0, (1.0, 0.3), 0.1, 400.0)
+    np.testing.assert_allclose(jnp.stack([x, v]), step(vector, 0.0, jnp.array([1.0, 0.3]), 0.1, 400.0), rtol=1e-9)
+
+
+def test_a_pair_whose_slope_of_position_uses_position_is_not_reduced():
+    def field(t, y, k):
+        return y[1] - y[0] ** 2, -k * y[0]
+
+    x, v = implicit_euler_step(field, 0.0, (1.0, 0.3), 0.1, 400.0)
+    slope = field(0.1, (x, v), 400.0)
+    np.testing.assert_allclose([x, v], [1.0 + 0.1 * slope[0], 0.3 + 0.1 * slope[1]], rtol=1e-9)
+
+
+@BY_NAME
+def test_complex_state(step):
+    y0 = {"z": jnp.array(1.0 + 2.0j)}
+    y = step(lambda t, y, args: {"z": (1j - 2) * y["z"]}, 0.0, y0, 0.5, None)
+    np.testing.assert_allclose(y["z"], (1 + 2j) / (1 - 0.5 * (1j - 2)), rtol=1e-10)
+
+
+@BY_NAME
+def test_derivatives_in_every_mode_equal_finite_differences(step):
+    end = stiff_end(step)
+    a, h = 50.0, 1e-3
+    difference = (end(a + h) - end(a - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(end)(a), difference, rtol=1e-5)
+    np.testing.assert_allclose(jax.jvp(end, (a,), (1.0,))[1], difference, rtol=1e-5)
+    second = (jax.grad(end)(a + h) - jax.grad(end)(a - h)) / (2 * h)
+    for twice in (jax.hessian(end), jax.grad(jax.grad(end)), jax.jacfwd(jax.jacfwd(end))):
+        np.testing.assert_allclose(twice(a), second, rtol=1e-5)
+    batch = jnp.array([1.0, 50.0, 100.0])
+    np.testing.assert_allclose(jax.vmap(jax.grad(end))(batch), [jax.grad(end)(a) for a in batch], rtol=1e-9)
+
+
+def test_gradient_equals_that_of_the_unrolled_newton_iteration():
+    def unrolled_step(f, t, y, dt, args):
+        def residual(z):
+            return z - y - dt * f(t + dt, z, args)
+
+        z = y
+        for _ in range(12):
+            z = z - jnp.linalg.solve(jax.jacfwd(residual)(z), residual(z))
+        return z
+
+    gradient, expected = (jax.grad(stiff_end(step))(50.0) for step in (implicit_euler_step, unrolled_step))
+    np.testing.assert_allclose(gradient, expected, rtol=1e-8)
+
+
+def test_reverse_mode_costs_one_linear_solve_a_step():
+    def loss(y):
+        return jnp.sum(implicit_euler_step(stiff_field, 0.0, y, 0.1, 50.0))
+
+    forward = str(jax.make_jaxpr(implicit_euler_step, static_argnums=0)(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0))
+    _, pullback = jax.vjp(loss, jnp.ones(2))
+    backward = str(jax.make_jaxpr(pullback)(1.0))
+    assert forward.count("root[") == 1
+    assert backward.count("custom_linear_solve[") == 1
+    assert "while" not in backward.split("custom_linear_solve[")[0]
+
+
+def test_step_that_does_not_converge_is_named():
+    """y = 1 + 100 dt exp(y) has no solution."""
+    growth = jeuler.solve(lambda t, y, k: k * jnp.exp(y), 1.0, dt=1e-3, num_steps=500, args=1.0, step=implicit_euler_step)
+    step = int(growth.first_nonfinite)
+    assert 300 < step < 400  # y' = exp(y) from 1 ends at t = exp(-1) = 0.368
+    assert jnp.isfinite(growth.y[step - 1])
+    assert jnp.isnan(growth.y[step])
+    _, info = implicit_euler_step.with_info(lambda t, y, k: k * jnp.exp(y), 0.0, 1.0, 1.0, 100.0)
+    assert not info.converged
+
+
+def test_gradient_through_a_step_that_does_not_converge_is_not_finite():
+    def loss(k):
+        return implicit_euler_step(lambda t, y, k: k * jnp.exp(y), 0.0, 1.0, 1.0, k)
+
+    assert not jnp.isfinite(jax.grad(loss)(100.0))
+
+
+def test_iterations_are_few_and_limited():
+    _, info = implicit_euler_step.with_info(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0)
+    assert info.converged
+    assert int(info.iterations) <= 6
+    _, info = implicit_euler(max_steps=1).with_info(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0)
+    assert not info.converged
+    assert int(info.iterations) == 1
+
+
+@pytest.mark.parametrize("bad", [{"rtol": 0.0}, {"atol": -1.0}, {"max_steps": 0}])
+def test_bad_options(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        implicit_euler(**bad)
+
+
+STIFF = {  # steps; where explicit Euler overflows at the same number of steps
+    "DETEST_stiff_A2": (500, True),
+    "DETEST_stiff_B5": (500, False),
+    "DETEST_stiff_C1": (500, True),
+    "DETEST_stiff_D2": (1000, True),
+    "DETEST_stiff_E2": (4000, False),
+    "MAZZIA_HIRES": (8000, True),
+    "MAZZIA_ROBER": (2000, True),
+}
+
+
+@pytest.mark.parametrize("name", STIFF)
+def test_stiff_problems_run_to_the_end_with_first_order_error(name, shared):
+    problems = json.loads((shared / "reference" / "ode_problems.json").read_text())["problems"]
+    problem = next(p for p in problems if p["name"] == name)
+    right_side = eval("lambda t, y: " + problem["rhs"], {"range": range})
+    y0, t1 = jnp.array(problem["y0"]), problem["t1"]
+    reference = np.array(problem["reference"])
+
+    def end(step, num_steps):
+        return jeuler.solve(
+            lambda t, y, args: jnp.stack(right_side(t, y)),
+            y0,
+            dt=t1 / num_steps,
+            num_steps=num_steps,
+            save_every=num_steps,
+            step=step,
+        )
+
+    steps, explicit_overflows = STIFF[name]
+    errors = []
+    for num_steps in (steps, 2 * steps):
+        solution = end(implicit_euler_step, num_steps)
+        assert solution.first_nonfinite == -1
+        errors.append(np.linalg.norm(solution.y[-1] - reference) / np.linalg.norm(reference))
+    assert 1.6 < errors[0] / errors[1] < 2.6
+    explicit = end(jeuler.euler_step, steps)
+    assert explicit_overflows == (int(explicit.first_nonfinite) > 0)
+
+
+def explicit_limit(scene, state):
+    """2 zeta / omega of the stiffest mode, by power iteration on the stiffness and the damping."""
+    start = jax.random.normal(jax.random.key(0), state.position.shape) * jnp.isfinite(state.mass)[:, None]
+
+    def acceleration(position, velocity):
+        return scene.vector_field(0.0, (position, velocity), state.mass)[1]
+
+    @jax.jit
+    def stiffness(u):
+        return jax.jvp(lambda x: acceleration(x, state.velocity), (state.position,), (u,))[1]
+
+    u = start
+    for _ in range(60):
+        u = stiffness(u)
+        omega_squared = jnp.linalg.norm(u)
+        u = u / omega_squared
+    damping = jax.jvp(lambda v: acceleration(state.position, v), (state.velocity,), (u,))[1]
+    return float(jnp.linalg.norm(damping) / omega_squared)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@BY_NAME
+def test_cloth_at_a_hundred_times_the_explicit_limit(step, dtype):
+    """64 x 64 particles, thrown out of shape: dt = 1e-3 where explicit Euler needs dt < 1e-5; the energy falls."""
+    state = cloth(64, dtype=dtype)
+    scene = cloth_scene(64, ks=2000.0, kd=0.01)
+    if dtype == jnp.float64:
+        assert explicit_limit(scene, state) < 1e-5
+
+    def energy(t, state):
+        return scene.energy(t, (state.position, state.velocity), state.mass)
+
+    solution = jeuler.simulate(scene, state, dt=1e-3, num_steps=5, step=step, save=energy)
+    assert solution.first_nonfinite == -1
+    assert solution.y.dtype == dtype
+    assert np.all(np.diff(solution.y) < 0)
+
+
+@BY_NAME
+def test_cloth_gradients_with_respect_to_ks_and_kd(step):
+    """At a hundred times the explicit limit, on 16 x 16 particles: more unknowns than the dense solver takes."""
+    state = cloth(16)
+
+    @jax.jit
+    def loss(parameters):
+        scene = cloth_scene(16, *parameters)
+        end = jeuler.simulate(scene, state, dt=1e-3, num_steps=4, save_every=4, step=step)
+        return jnp.sum(end.y.position[-1] ** 2)
+
+    parameters, h = jnp.array([2000.0, 0.01]), jnp.array([1.0, 1e-4])
+    gradient = jax.grad(loss)(parameters)
+    for k in range(2):
+        change = jnp.zeros(2).at[k].set(h[k])
+        difference = (loss(parameters + change) - loss(parameters - change)) / (2 * h[k])
+        np.testing.assert_allclose(gradient[k], difference, rtol=1e-5)
