@@ -92,10 +92,9 @@ def diffrax_euler(work: Work, adjoint=diffrax.RecursiveCheckpointAdjoint) -> Pai
     term = diffrax.ODETerm(lambda t, y, args: (y[1], acceleration(*y, *args)))
 
     def final(position, velocity, ks, kd):
-        end = work.steps * DT
         solution = diffrax.diffeqsolve(
-            term, diffrax.Euler(), 0.0, end, DT, (position, velocity), args=(ks, kd), adjoint=adjoint(),
-            stepsize_controller=diffrax.StepTo(jnp.linspace(0.0, end, work.steps + 1)), max_steps=work.steps,
+            term, diffrax.Euler(), 0.0, work.steps * DT, DT, (position, velocity), args=(ks, kd), adjoint=adjoint(),
+            max_steps=work.steps + 1,
         )  # fmt: skip
         return solution.ys[0][0]
 

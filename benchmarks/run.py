@@ -141,6 +141,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--all", action="store_true", help="also the large systems, up to a million springs")
     parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--no-memory", action="store_true", help="leave the table of memory out")
     parser.add_argument("--only", default="", help="only works whose name contains this")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent / "results")
     options = parser.parse_args()
@@ -158,7 +159,8 @@ def main() -> None:
         if options.only in work.name:
             results[work.name] = measure(work, options.rounds)
             print(table({work.name: results[work.name]}), flush=True)
-    text = f"{versions()}\n\n{table(results)}\n\n{memory.table()}\n"
+    parts = [versions(), table(results), *([] if options.no_memory else [memory.table()])]
+    text = "\n\n".join(parts) + "\n"
     print(text)
     (options.out / "results.md").write_text(text)
     figure(results, options.out / "results.png")
