@@ -129,10 +129,12 @@ class Scene:
         mass = jnp.asarray(mass, dtype=position.dtype)
         velocity = by_component(lambda v: jnp.where(jnp.isinf(mass), 0, v), velocity)
         position, velocity = self.constrain(t, position, velocity)
-        force = jnp.zeros_like(position)
-        for part in self.forces:
-            force = by_component(jnp.add, force, part(t, position, velocity, mass))
-        slope = velocity, by_component(lambda f: f / mass, force)
+        x, v = split(position), split(velocity)
+        force = [jnp.zeros_like(component) for component in x]
+        for part in self.forces:  # each gets arrays of its own, so that derivatives too are summed by component
+            share = split(part(t, stack(x), stack(v), mass))
+            force = [a + b for a, b in zip(force, share, strict=True)]
+        slope = stack(v), stack([f / mass for f in force])
         for effect in self.effects:
             if hasattr(effect, "constrain_slope"):
                 slope = effect.constrain_slope(t, *slope)

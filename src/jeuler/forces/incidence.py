@@ -13,7 +13,7 @@ A *layout* says in what order the edges lie in memory, in *slots*, so that both 
   opposite signs, so that B^T sums a row and needs no look-up, and B gathers only the far ends.
 - `Pairs`: a few edges. Two gathers and two scatters, as one would write it by hand.
 
-Empty slots hold 0 in every B x, and what is made of them by multiplication stays 0.
+Slots may be empty; what a force puts there must be 0, which `Layout.to_slots` sees to.
 """
 
 from __future__ import annotations
@@ -35,11 +35,13 @@ class Layout:
 
     Attributes:
       copies: how often each edge is held, 1 or 2.
+      clean: whether B x is 0 in empty slots. Where it is not, a force must vanish there: stiffness 0 does it.
       slot_edges: one integer array a group: the edge in each slot, -1 for none.
       tables: the integer and boolean arrays that the two maps look things up in.
     """
 
     copies: int
+    clean: bool
     particles: int
     slot_edges: tuple[np.ndarray, ...]
     tables: tuple[np.ndarray, ...]
@@ -53,9 +55,9 @@ class Layout:
         return accumulate_p.bind(*slots, *self.tables, layout=self)
 
     def to_slots(self, x: Array) -> list[Array]:
-        """A value of each edge, () or (edge,), as one array a group; empty slots hold 0."""
+        """A value of each edge, () or (edge,), as one array a group; empty slots hold 0 where B x may not be 0."""
         if x.ndim == 0:
-            return [x] * len(self.slot_edges)
+            return [x if self.clean else jnp.where(edges < 0, 0, x) for edges in self.slot_edges]
         x = jnp.concatenate([x, jnp.zeros_like(x, shape=(1,))])  # slot -1 reads the zero at the end
         return [x[np.where(edges < 0, len(x) - 1, edges)] for edges in self.slot_edges]
 
@@ -74,10 +76,12 @@ class Shifts(Layout):
         B^T f at i    = f[i + k] - f[i]
 
     The padding costs k empty slots at each end and frees both maps of branches, so that they vectorise. A slot takes
-    2 loads a component in B, 2 in B^T, and no index.
+    2 loads a component in B, 2 in B^T, no index and no mask: an empty slot holds the difference of some two particles,
+    which a stiffness of 0 takes out.
     """
 
     copies = 1
+    clean = False
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         low, high = edges.min(axis=1), edges.max(axis=1)
@@ -90,17 +94,14 @@ class Shifts(Layout):
             group[high[chosen]] = numbers[chosen]
             groups.append(group)
         self.slot_edges = tuple(groups)
-        self.tables = tuple(group >= 0 for group in groups)
+        self.tables = ()
 
-    def _difference(self, x, *occupied):
+    def _difference(self, x):
         n, reach = self.particles, max(self.offsets)
         x = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(reach, reach)])
-        return [
-            jnp.where(here, x[..., reach - k : reach + n] - x[..., reach : reach + n + k], 0)
-            for k, here in zip(self.offsets, occupied, strict=True)
-        ]
+        return [x[..., reach - k : reach + n] - x[..., reach : reach + n + k] for k in self.offsets]
 
-    def _accumulate(self, slots, *occupied):
+    def _accumulate(self, slots):
         n = self.particles
         return sum(f[..., k:] - f[..., :n] for k, f in zip(self.offsets, slots, strict=True))
 
@@ -124,6 +125,7 @@ class Rows(Layout):
     """
 
     copies = 2
+    clean = True
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles
@@ -198,6 +200,7 @@ class Pairs(Layout):
     """A few edges, as one would write it: a slot an edge, two gathers in B, two scatters in B^T."""
 
     copies = 1
+    clean = True
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles

@@ -28,20 +28,16 @@ def direction(d: Array) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def inverse_length(square: Array) -> Array:
-    """1 / r from r^2, and 0 with all its derivatives where the ends coincide (see `direction`).
-
-    The derivative of 1 / r is written without a division, -(1/r)^2 (1/r) d(r^2)/2, in factors that do not overflow.
-    """
-    apart = square > jnp.finfo(square.dtype).tiny ** (2 / 3)
-    return jnp.where(apart, lax.rsqrt(jnp.where(apart, square, 1)), 0)
+def length(square: Array) -> Array:
+    """r from r^2; 0, and all derivatives 0, where the ends coincide (see `direction`). dr = d(r^2) / 2r."""
+    return jnp.sqrt(jnp.where(square > jnp.finfo(square.dtype).tiny ** (2 / 3), square, 0))
 
 
-@inverse_length.defjvp
-def _inverse_length_jvp(primals, tangents):
-    inverse = inverse_length(*primals)
+@length.defjvp
+def _length_jvp(primals, tangents):
+    r = length(*primals)
     (change,) = tangents
-    return inverse, -(inverse * inverse) * (inverse * change * 0.5)
+    return r, jnp.where(r > 0, change / 2, 0) / jnp.where(r > 0, r, 1)
 
 
 def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
@@ -54,14 +50,17 @@ def spring_force(
 ) -> list[Array]:
     """The force on the first end of each spring, from d = p_i - p_j and v_i - v_j, one array a component.
 
-        F = c d,   c = -ks + (ks L - kd v.u) / r,   u = d / r
+        F = c d,   c = (ks (L - r) - kd v.u) / r,   u = d / r
 
-    the same as ks (L - r) u - kd (v.u) u, but one number c a spring, a number also at r = 0, where it is -ks with all
-    its derivatives 0: for L = 0 the Jacobian there is -ks I.
+    At r = 0, c is the number -ks with all its derivatives 0 (see `direction`), so that for L = 0 the Jacobian there is
+    -ks I. One number c a spring: it ends in a division, which the compiler does not do twice, so it is stored and the
+    components of F, at either end, are products with it.
     """
-    inverse = inverse_length(dot(d, d))
-    approach = dot(relative_velocity, d) * inverse
-    c = -ks + (ks * rest_length - kd * approach) * inverse
+    r = length(dot(d, d))
+    apart = r > 0
+    divisor = jnp.where(apart, r, 1)
+    approach = dot(relative_velocity, d) / divisor
+    c = jnp.where(apart, ks * (rest_length - r) - kd * approach, -ks) / divisor
     return [c * component for component in d]
 
 
