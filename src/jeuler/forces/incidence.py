@@ -251,6 +251,23 @@ def group_widths(length: np.ndarray) -> np.ndarray:
     return np.array(widths[::-1])
 
 
+stored_p = Primitive("stored")
+
+
+def stored(x: Array) -> Array:
+    """x, worked out once and stored, where the compiler would work it out again for each of its uses.
+
+    XLA on CPU fuses what it thinks cheap into every consumer: the cotangent of B x, a dozen operations, would be done
+    twice, once for either end. A division it never repeats. This is one, by a number that is 1 but not a constant to
+    XLA; LLVM, which comes after, knows that no float is greater than inf and drops the division.
+    """
+    return stored_p.bind(x)
+
+
+def _stored(x):
+    return x / jnp.where(x > jnp.inf, 2, 1).astype(x.dtype)
+
+
 # The two primitives. Operands: an array (..., particle), or one array (..., *slots) a group, then the layout's tables.
 # Leading axes are batches.
 
@@ -294,7 +311,8 @@ def _accumulate_jvp(primals, tangents, *, layout):
 
 
 def _difference_transpose(cotangents, x, *tables, layout):
-    total = accumulate_p.bind(*map(ad.instantiate_zeros, cotangents), *tables, layout=layout)
+    slots = [stored(ad.instantiate_zeros(slot)) for slot in cotangents]
+    total = accumulate_p.bind(*slots, *tables, layout=layout)
     return [layout.copies * total, *[None] * len(tables)]
 
 
@@ -320,6 +338,12 @@ def _accumulate_batch(operands, axes, *, layout):
     slots = [_batch_first(x, axis, size) for x, axis in zip(operands[:groups], axes[:groups], strict=True)]
     return accumulate_p.bind(*slots, *operands[groups:], layout=layout), 0
 
+
+stored_p.def_impl(lambda x: x)
+stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
+mlir.register_lowering(stored_p, mlir.lower_fun(_stored, multiple_results=False))
+ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])
+batching.defvectorized(stored_p)
 
 for primitive, rule, shape in (
     (difference_p, _difference, _difference_shape),
