@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
+from jeuler._components import by_component, split, stack
 from jeuler.forces.fields import per_particle
 from jeuler.methods import Step, euler_step
 from jeuler.solve import Checkpoint, Grid, Solution, advance_by, march, no_loss
@@ -130,16 +132,23 @@ class Scene:
         """
         position, velocity = y
         mass = jnp.asarray(mass, dtype=position.dtype)
-        velocity = jnp.where(per_particle(jnp.isinf(mass)), 0, velocity)
+        velocity = by_component(lambda v: jnp.where(jnp.isinf(mass), 0, v), velocity)
         position, velocity = self.constrain(t, position, velocity)
-        force = jnp.zeros_like(position)
-        for part in self.forces:
-            force = force + part(t, position, velocity, mass)
-        slope = velocity, force / per_particle(mass)
+        x, v = split(position), split(velocity)
+        force = [jnp.zeros_like(component) for component in x]
+        for part in self.forces:  # each gets arrays of its own, so that derivatives too are summed by component
+            share = split(part(t, stack(x), stack(v), mass))
+            force = [a + b for a, b in zip(force, share, strict=True)]
+        slope = stack(v), stack([f / mass for f in force])
         for effect in self.effects:
             if hasattr(effect, "constrain_slope"):
                 slope = effect.constrain_slope(t, *slope)
         return slope
+
+    def prepare(self, particles: int, dtype: Any) -> Scene:
+        """The same scene with the work done that is the same at every step."""
+        forces = (part.prepare(particles, dtype) if hasattr(part, "prepare") else part for part in self.forces)
+        return _tree.replace(self, forces=tuple(forces))
 
     def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
         """Position and velocity at time t with the prescribed ones put in."""
@@ -214,16 +223,21 @@ def simulate(
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=_tree.time_dtype(state.position))
     state = _at_start(scene, state, grid.t0)
     motion = _check.state("state", (state.position, state.velocity))
-    field = scene.vector_field
-    _check.same_form("the sum of forces", motion, jax.eval_shape(field, grid.t0, motion, state.mass))
-    advance = advance_by(step, compensated=compensated)
+    _check.same_form("the sum of forces", motion, jax.eval_shape(scene.vector_field, grid.t0, motion, state.mass))
+    prepared = scene.prepare(*motion[0].shape[:1], motion[0].dtype)
+    advance = advance_by(step if hasattr(step, "increment") else _on_arrays(step), compensated=compensated)
+
+    def field(t, motion, mass):  # on components, as they are carried from step to step
+        slope = prepared.vector_field(t, tuple(map(stack, motion)), mass)
+        return tuple(map(split, slope))
 
     def next_state(n, t, state_and_lost):
-        previous, lost = state_and_lost
-        state = previous
-        motion = state.position, state.velocity
-        (position, velocity), lost = advance(field, t, (motion, lost), grid.dt, state.mass)
-        state = _tree.replace(state, position=position, velocity=velocity)
+        (motion, state), lost = state_and_lost
+        previous = joined(state_and_lost[0]) if scene.effects else None
+        motion, lost = advance(field, t, (motion, lost), grid.dt, state.mass)
+        if not scene.effects:
+            return (motion, state), lost
+        state = joined((motion, state))
         for index, effect in enumerate(scene.effects):
             own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, n), index)
             now = grid.clock(n + 1), grid.dt
@@ -231,10 +245,38 @@ def simulate(
                 state = effect.over_step(*now, previous, state, own_key)
             else:
                 state = effect(*now, state, own_key)
-        return state, lost
+        return parted(state), lost
 
-    start = state, no_loss(motion, compensated)
-    return march(next_state, start, grid, save, watch=lambda state: (state.position, state.velocity))
+    def saved(t, parts):
+        state = joined(parts)
+        return state if save is None else save(t, state)
+
+    start = parted(state), no_loss(parted(state)[0], compensated)
+    return march(next_state, start, grid, saved, watch=lambda parts: parts[0])
+
+
+def _on_arrays(step: Step) -> Step:
+    """A step of somebody's own, which may do arithmetic on (particle, dim) arrays, for the motion by components."""
+
+    def by_components(f, t, motion, dt, mass):
+        def on_arrays(t, y, mass):
+            return tuple(map(stack, f(t, tuple(map(split, y)), mass)))
+
+        return tuple(map(split, step(on_arrays, t, tuple(map(stack, motion)), dt, mass)))
+
+    return functools.wraps(step)(by_components)
+
+
+def parted(state: ParticleState) -> tuple[tuple, ParticleState]:
+    """A state as it is carried from step to step: the motion by components, and the rest."""
+    motion = split(state.position), split(state.velocity)
+    return motion, _tree.replace(state, position=None, velocity=None)
+
+
+def joined(parts: tuple[tuple, ParticleState]) -> ParticleState:
+    """The state of these parts."""
+    (position, velocity), rest = parts
+    return _tree.replace(rest, position=stack(position), velocity=stack(velocity))
 
 
 def _at_start(scene: Scene, state: ParticleState, t0: Array) -> ParticleState:

@@ -187,7 +187,11 @@ def no_loss(y: PyTree, compensated: bool) -> PyTree:
 
 
 def advance_by(step: Any, *, compensated: bool) -> Callable:
-    """The step on the pair (y, what rounding has cut off y so far; None in plain sums)."""
+    """The step on the pair (y, what rounding has cut off y so far; None in plain sums).
+
+    Reverse mode keeps what an explicit step starts from and works the rest out again: that is less work than to store
+    and load all that the step computes on its way. A step that solves equations keeps its solution.
+    """
     if not compensated:
 
         def plain(f, t, y_and_lost, dt, args):
@@ -196,7 +200,7 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
             _check.same_form("the step", y, y_next)
             return y_next, None
 
-        return plain
+        return _recomputed(plain) if hasattr(step, "increment") else plain
 
     if not hasattr(step, "increment"):
         name = getattr(step, "__name__", repr(step))
@@ -217,4 +221,14 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
         pairs = jax.tree.map(two_sum, y, increment)
         return jax.tree.transpose(jax.tree.structure(y), jax.tree.structure((0, 0)), pairs)
 
-    return compensating
+    return _recomputed(compensating)
+
+
+def _recomputed(advance: Callable) -> Callable:
+    """The same function, of which reverse mode keeps nothing but the arguments."""
+
+    def outer(f, t, y_and_lost, dt, args):
+        inner = jax.checkpoint(functools.partial(advance, f), prevent_cse=False)
+        return inner(t, y_and_lost, dt, args)
+
+    return outer

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from jeuler import _tree
+from jeuler._components import split, stack
+from jeuler.forces.incidence import Layout
 from jeuler.forces.topology import Topology
 
 
@@ -23,16 +27,41 @@ def direction(d: Array) -> tuple[Array, Array]:
     return r, jnp.where(apart, d / jnp.where(apart, r, 1), 0)
 
 
-def spring_force(d: Array, relative_velocity: Array, ks: Array, kd: Array, rest_length: Array) -> Array:
-    """The force on the first end of each spring, (spring, dim).
+@jax.custom_jvp
+def length(square: Array) -> Array:
+    """r from r^2; 0, and all derivatives 0, where the ends coincide (see `direction`). dr = d(r^2) / 2r."""
+    return jnp.sqrt(jnp.where(square > jnp.finfo(square.dtype).tiny ** (2 / 3), square, 0))
 
-        F = -ks d + (ks L - kd (v.u)) u
 
-    the same as ks (L - |d|) u - kd (v.u) u, but linear in d where L = 0, so that its derivative at d = 0 is -ks I.
+@length.defjvp
+def _length_jvp(primals, tangents):
+    r = length(*primals)
+    (change,) = tangents
+    return r, jnp.where(r > 0, change / 2, 0) / jnp.where(r > 0, r, 1)
+
+
+def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    """x.y of vectors given as one array a component."""
+    return sum(a * b for a, b in zip(x, y, strict=True))  # type: ignore[return-value]
+
+
+def spring_force(
+    d: Sequence[Array], relative_velocity: Sequence[Array], ks: Array, kd: Array, rest_length: Array
+) -> list[Array]:
+    """The force on the first end of each spring, from d = p_i - p_j and v_i - v_j, one array a component.
+
+        F = c d,   c = (ks (L - r) - kd v.u) / r,   u = d / r
+
+    At r = 0, c is the number -ks with all its derivatives 0 (see `direction`), so that for L = 0 the Jacobian there is
+    -ks I. One number c a spring: it ends in a division, which the compiler does not do twice, so it is stored and the
+    components of F, at either end, are products with it.
     """
-    _, u = direction(d)
-    approach = jnp.sum(relative_velocity * u, axis=-1, keepdims=True)
-    return -ks * d + (ks * rest_length - kd * approach) * u
+    r = length(dot(d, d))
+    apart = r > 0
+    divisor = jnp.where(apart, r, 1)
+    approach = dot(relative_velocity, d) / divisor
+    c = jnp.where(apart, ks * (rest_length - r) - kd * approach, -ks) / divisor
+    return [c * component for component in d]
 
 
 @_tree.component(static=("edges",))
@@ -71,10 +100,13 @@ class Springs:
         _tree.store_as_float(self, "ks", "kd", "rest_length")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        ks, kd, rest_length = (self._per_spring(x, position.dtype) for x in (self.ks, self.kd, self.rest_length))
-        d, relative_velocity = self.edges.difference(position), self.edges.difference(velocity)
-        force = spring_force(d, relative_velocity, ks, kd, rest_length)
-        return self.edges.accumulate(force, len(position))
+        return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
+
+    def prepare(self, particles: int, dtype: Any) -> PreparedSprings:
+        """The same force with its parameters laid out for the kernels, which is the same work at every step."""
+        layouts = self.edges.layouts(particles)
+        parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
+        return PreparedSprings(layouts, *([layout.to_slots(x) for layout in layouts] for x in parameters))
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks (r - L)^2 / 2, J."""
@@ -94,3 +126,24 @@ class Springs:
                 raise ValueError(
                     f"Springs.{name} must have shape () or ({len(self.edges)},), one a spring, got {shape}"
                 )
+
+
+@_tree.component(static=("layouts",))
+class PreparedSprings:
+    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and group."""
+
+    layouts: tuple[Layout, ...]
+    ks: Any
+    kd: Any
+    rest_length: Any
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        x, v = split(position), split(velocity)
+        total = [jnp.zeros_like(component) for component in x]
+        for layout, *parameters in zip(self.layouts, self.ks, self.kd, self.rest_length, strict=True):
+            d = zip(*map(layout.difference, x), strict=True)
+            relative_velocity = zip(*map(layout.difference, v), strict=True)
+            forces = [spring_force(*group) for group in zip(d, relative_velocity, *parameters, strict=True)]
+            shares = map(layout.accumulate, zip(*forces, strict=True))
+            total = [a + b for a, b in zip(total, shares, strict=True)]
+        return stack(total)

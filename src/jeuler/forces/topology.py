@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from jeuler.forces.incidence import Layout, Pairs, Rows, Shifts
+
+MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
+SHIFT_GAIN = 4  # how many slots of Shifts cost what one edge costs in Rows
+FEW = 8  # Pairs for less than one edge in so many particles
 
 
 class Topology:
@@ -69,6 +76,15 @@ class Topology:
                 f"got edges[{first}] = {self.edges[first].tolist()}"
             )
 
+    def layouts(self, particles: int) -> tuple[Layout, ...]:
+        """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
+
+        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
+        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. Of
+        the others, if they are less than one in FEW particles, `Pairs`, else `Rows`.
+        """
+        return _layouts(self, particles)
+
     def difference(self, x: Array) -> Array:
         """B x: (particle, dim) to (spring, dim)."""
         return x[self.edges[:, 0]] - x[self.edges[:, 1]]
@@ -77,3 +93,31 @@ class Topology:
         """B^T f: (spring, dim) to (particle, dim)."""
         total = jnp.zeros((particles, *force.shape[1:]), force.dtype)
         return total.at[self.edges[:, 0]].add(force).at[self.edges[:, 1]].add(-force)
+
+
+@functools.lru_cache(maxsize=64)
+def _layouts(topology: Topology, particles: int) -> tuple[Layout, ...]:
+    edges, numbers = topology.edges, np.arange(len(topology))
+    if not len(edges):
+        return ()
+    offset = np.abs(edges[:, 1] - edges[:, 0])
+    offsets, counts = np.unique(offset, return_counts=True)
+    worth = SHIFT_GAIN * counts > particles + offsets
+    commonest = np.argsort(-counts[worth], kind="stable")[:MOST_GROUPS]
+    regular = np.isin(offset, offsets[worth][commonest]) & _first_of_its_kind(edges)
+    others = ~regular
+    layouts: list[Layout] = []
+    if regular.any():
+        layouts.append(Shifts(edges[regular], numbers[regular], particles))
+    if others.any():
+        kind = Pairs if FEW * np.count_nonzero(others) < particles else Rows
+        layouts.append(kind(edges[others], numbers[others], particles))
+    return tuple(layouts)
+
+
+def _first_of_its_kind(edges: np.ndarray) -> np.ndarray:
+    """Whether no earlier edge joins the same two particles."""
+    _, first = np.unique(np.sort(edges, axis=1), axis=0, return_index=True)
+    out = np.zeros(len(edges), bool)
+    out[first] = True
+    return out
