@@ -12,9 +12,11 @@ from jax import Array
 from jax.typing import ArrayLike
 
 PyTree = Any
+Parameter = Any  # of a component: a number, list or array as passed, a floating array as kept
 T = TypeVar("T")
 
 
+@dataclass_transform(frozen_default=True)
 def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
     """Make a class a frozen dataclass that is also a pytree.
 
@@ -23,7 +25,6 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
     transformation's placeholder.
     """
 
-    @dataclass_transform(frozen_default=True)
     def decorate(cls: type[T]) -> type[T]:
         cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
         names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]
@@ -52,7 +53,7 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
 
 def as_float(x: ArrayLike | None) -> Array | None:
     """A parameter as a floating array; Python numbers stay weakly typed, so they follow the state's dtype."""
-    if x is None or isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact):
+    if x is None or (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact)):
         return x
     if isinstance(x, (bool, int, float)):
         return jnp.asarray(float(x))
@@ -74,6 +75,11 @@ class Function:
 
     def __call__(self, *args: Any) -> Any:
         return self.function(*args)
+
+
+def replace(component: T, **changes: Any) -> T:
+    """The component with some fields changed; ``dataclasses.replace``, as type checkers understand it."""
+    return dataclasses.replace(component, **changes)  # type: ignore[type-var]
 
 
 def as_component(x: Any) -> Any:

@@ -1,5 +1,26 @@
-"""Effects: ``effect(t, dt, state, key) -> state`` after each step, in the order written. One file a family."""
+"""Effects: ``effect(t, dt, state, key) -> state`` at each step, in the order written. One file a family."""
 
+from jeuler.effects.appearance import OverLife, SpeedLimit
+from jeuler.effects.lifecycle import Death, DeathOnContact, DeathOutside, Emitter, Lifetime
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
+from jeuler.effects.samplers import Choice, Cone, Disc, Line, Normal, Sphere, Surface, Uniform
 
-__all__ = ["PrescribedMotion", "SampledPath"]
+__all__ = [
+    "Choice",
+    "Cone",
+    "Death",
+    "DeathOnContact",
+    "DeathOutside",
+    "Disc",
+    "Emitter",
+    "Lifetime",
+    "Line",
+    "Normal",
+    "OverLife",
+    "PrescribedMotion",
+    "SampledPath",
+    "SpeedLimit",
+    "Sphere",
+    "Surface",
+    "Uniform",
+]
