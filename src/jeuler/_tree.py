@@ -73,8 +73,8 @@ class Function:
 
     function: Callable
 
-    def __call__(self, *args: Any) -> Any:
-        return self.function(*args)
+    def __call__(self, *args: Any, **fields: Any) -> Any:
+        return self.function(*args, **fields)
 
 
 def replace(component: T, **changes: Any) -> T:

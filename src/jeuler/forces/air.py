@@ -15,7 +15,7 @@ def as_air(air: Any) -> Any:
     """Air given as one field, several that add up, a velocity (dim,), or None for air at rest."""
     if air is None:
         return ()
-    if isinstance(air, (tuple, list)) and any(callable(part) for part in air):
+    if isinstance(air, (tuple, list)) and all(callable(part) for part in air):
         return tuple(_tree.as_component(part) for part in air)
     return (_tree.as_component(air) if callable(air) else Wind(air),)
 
