@@ -48,7 +48,7 @@ EFFECTS = {
     "lifetime": (Lifetime(0.5), {"alive", "age"}),
     "death": (Death(lambda t, state: state.position[:, 0] > 0.8), {"alive"}),
     "death outside": (DeathOutside(-1.0, 1.0), {"alive"}),
-    "death on contact": (DeathOnContact(lambda p: p[:, 2]), {"alive"}),
+    "death on contact": (DeathOnContact(lambda t, p: p[2]), {"alive"}),
 }
 LIFE = Lifetime(0.5)
 OVER_LIFE = {name: OverLife(name, values, duration=0.5) for name, values in {

@@ -14,12 +14,12 @@ from jeuler.effects import (
     DeathOnContact,
     DeathOutside,
     Emitter,
+    FromLine,
+    FromSphere,
     Lifetime,
-    Line,
     Normal,
     OverLife,
     SpeedLimit,
-    Sphere,
     Uniform,
 )
 from jeuler.forces import LinearDrag, PointAttractor, ShapeMatching, Viscosity
@@ -90,7 +90,7 @@ def test_a_dead_slot_holds_zeros_and_nothing_is_not_a_number():
     drag = LinearDrag(0.2, air=[1.0, 0.0])
     sun = PointAttractor([0.0, 0.0], 5.0, softening=1e-3)
     emitter = Emitter(
-        200.0, Sphere([0.0, 0.5], 0.2), Cone([0.0, 1.0], Uniform(1.0, 3.0), 0.5), lifetime=Uniform(0.05, 0.2),
+        200.0, FromSphere([0.0, 0.5], 0.2), Cone([0.0, 1.0], Uniform(1.0, 3.0), 0.5), lifetime=Uniform(0.05, 0.2),
         color=Choice(np.eye(3)), opacity=Uniform(0.2, 1.0), mass=Uniform(0.5, 2.0), extra={"heat": Uniform(1.0, 2.0)},
     )  # fmt: skip
     effects = (emitter, Lifetime(), DeathOutside([-2.0, 0.0], [2.0, 2.0]), OverLife("size", [0.1, 0.0]))
@@ -153,7 +153,7 @@ def test_deaths_by_age_place_contact_and_condition():
     everyone = [True, True, True]
     assert alive(Lifetime(0.3)) == [everyone] * 4
     assert alive(Lifetime(0.2)) == [everyone, everyone, everyone, [False] * 3]
-    assert alive(DeathOnContact(lambda p: p[:, 1]))[1] == [True, False, True]
+    assert alive(DeathOnContact(lambda t, p: p[1]))[1] == [True, False, True]
     assert alive(DeathOutside(low=-jnp.inf, high=[2.0, jnp.inf]))[1] == [True, True, False]
     assert alive(Death(lambda t, state: t > 0.15))[1:] == [everyone, everyone, [False] * 3]
 
@@ -173,7 +173,7 @@ def test_the_classical_order_births_attributes_deaths_motion_appearance():
 
 
 def test_newborns_take_nothing_from_the_slot_before_them():
-    red = Emitter(0.0, **POINT, bursts=((0.0, 3),), color=[1.0, 0.0, 0.0], lifetime=0.05, size=5.0)
+    red = Emitter(0.0, **POINT, bursts=((0.0, 3),), color=[1.0, 0.0, 0.0], lifetime=1e-3, size=5.0)
     plain = Emitter(0.0, **POINT, bursts=((0.2, 3),))
     state = simulate(Scene(effects=(red, plain, Lifetime())), empty_pool(3, 2), dt=0.1, num_steps=4, key=KEY).y
     assert state.color[1].tolist() == [[1.0, 0.0, 0.0]] * 3
@@ -184,7 +184,7 @@ def test_newborns_take_nothing_from_the_slot_before_them():
 
 
 def test_one_attribute_more_does_not_change_the_draws_of_the_others():
-    named = {"position": Line([0.0, 0.0], [1.0, 0.0]), "velocity": Normal([0.0, 1.0], 0.3)}
+    named = {"position": FromLine([0.0, 0.0], [1.0, 0.0]), "velocity": Normal([0.0, 1.0], 0.3)}
     plain = births(Emitter(50.0, **named), dt=0.1, num_steps=3, capacity=20)
     coloured = births(Emitter(50.0, **named, color=Uniform([0.0] * 3, 1.0)), dt=0.1, num_steps=3, capacity=20)
     assert np.array_equal(plain.position, coloured.position)

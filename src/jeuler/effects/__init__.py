@@ -3,7 +3,7 @@
 from jeuler.effects.appearance import OverLife, SpeedLimit
 from jeuler.effects.lifecycle import Death, DeathOnContact, DeathOutside, Emitter, Lifetime
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
-from jeuler.effects.samplers import Choice, Cone, Disc, Line, Normal, Sphere, Surface, Uniform
+from jeuler.effects.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
 
 __all__ = [
     "Choice",
@@ -11,16 +11,16 @@ __all__ = [
     "Death",
     "DeathOnContact",
     "DeathOutside",
-    "Disc",
     "Emitter",
+    "FromDisc",
+    "FromLine",
+    "FromSphere",
+    "FromSurface",
     "Lifetime",
-    "Line",
     "Normal",
     "OverLife",
     "PrescribedMotion",
     "SampledPath",
     "SpeedLimit",
-    "Sphere",
-    "Surface",
     "Uniform",
 ]

@@ -30,7 +30,7 @@ class Emitter:
 
     Args:
       rate: births a second, (), 1/s, >= 0.
-      position: where, a sampler ``(key, count) -> (count, dim)`` such as `Sphere` or `Line`, or one point (dim,), m.
+      position: where, a sampler ``(key, count) -> (count, dim)`` such as `FromSphere` or `FromLine`, or one point (dim,), m.
       velocity: how fast, a sampler such as `Cone` or `Normal`, or one vector (dim,), m/s.
       lifetime, mass, color, opacity, size, shape: what newborns get, a sampler or one value; None leaves the field
         out of the state, or at its default where another part of the scene has it.
@@ -274,29 +274,31 @@ class DeathOutside:
 class DeathOnContact:
     """Death by touching a surface.
 
-        a particle dies where distance(p) <= margin
+        a particle dies where distance(t, p) <= margin
 
     Args:
-      distance: signed distance to the surface, ``distance(position) -> (particle,)`` in m, negative inside.
+      collider: the signed distance ``collider(t, point) -> ()`` of one point (dim,), m, negative inside; what
+        `Collisions` takes too.
       margin: (), m, how near is contact.
     Returns: called as an effect ``(t, dt, state, key)``, the state without the particles in contact.
     Example:
       >>> import jax.numpy as jnp, jeuler
-      >>> scene = jeuler.Scene(effects=(jeuler.DeathOnContact(lambda p: p[:, 1]),))
+      >>> ground = jeuler.DeathOnContact(lambda t, p: p[1])
       >>> state = jeuler.ParticleState(jnp.array([[0.0, -1.0], [0.0, 2.0]]), jnp.zeros((2, 2)))
-      >>> jeuler.simulate(scene, state, dt=0.1, num_steps=1).y.alive[-1].tolist()
+      >>> jeuler.simulate(jeuler.Scene(effects=(ground,)), state, dt=0.1, num_steps=1).y.alive[-1].tolist()
       [False, True]
     """
 
-    distance: Any
+    collider: Any
     margin: Array = 0.0  # type: ignore[assignment]
 
     before_motion = True
     writes = ("alive",)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "distance", _tree.as_component(self.distance))
+        object.__setattr__(self, "collider", _tree.as_component(self.collider))
         _tree.store_as_float(self, "margin")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
-        return state.replace(alive=state.alive & (self.distance(state.position) > self.margin))
+        distance = jax.vmap(self.collider, (None, 0))(t, state.position)
+        return state.replace(alive=state.alive & (distance > self.margin))

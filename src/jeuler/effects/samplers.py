@@ -109,7 +109,7 @@ class Choice:
 
 
 @_tree.component()
-class Line:
+class FromLine:
     """Uniform on a line segment.
 
         x = start + (end - start) u
@@ -120,7 +120,7 @@ class Line:
     Returns: called as ``sampler(key, count)``, (count, dim), m.
     Example:
       >>> import jax, jeuler
-      >>> x = jeuler.Line([0.0, 1.0], [2.0, 1.0])(jax.random.key(0), 3)
+      >>> x = jeuler.FromLine([0.0, 1.0], [2.0, 1.0])(jax.random.key(0), 3)
       >>> x.shape, x[:, 1].tolist()
       ((3, 2), [1.0, 1.0, 1.0])
     """
@@ -136,7 +136,7 @@ class Line:
 
 
 @_tree.component()
-class Disc:
+class FromDisc:
     """Uniform on a disc: in the plane, or in space across a normal.
 
         x = center + radius sqrt(u) (cos a, sin a)
@@ -148,7 +148,7 @@ class Disc:
     Returns: called as ``sampler(key, count)``, (count, dim), m.
     Example:
       >>> import jax, jeuler
-      >>> x = jeuler.Disc([0.0, 0.0, 5.0], 1.0)(jax.random.key(0), 4)
+      >>> x = jeuler.FromDisc([0.0, 0.0, 5.0], 1.0)(jax.random.key(0), 4)
       >>> x.shape, x[:, 2].tolist()
       ((4, 3), [5.0, 5.0, 5.0, 5.0])
     """
@@ -171,7 +171,7 @@ class Disc:
 
 
 @_tree.component(static=("surface",))
-class Sphere:
+class FromSphere:
     """Uniform in a ball, or on its surface, in any dimension.
 
         x = center + radius u^(1/dim) n / |n|,   n standard normal
@@ -183,7 +183,7 @@ class Sphere:
     Returns: called as ``sampler(key, count)``, (count, dim), m.
     Example:
       >>> import jax, jax.numpy as jnp, jeuler
-      >>> x = jeuler.Sphere([0.0, 0.0, 0.0], 2.0, surface=True)(jax.random.key(0), 4)
+      >>> x = jeuler.FromSphere([0.0, 0.0, 0.0], 2.0, surface=True)(jax.random.key(0), 4)
       >>> bool(jnp.allclose(jnp.linalg.norm(x, axis=1), 2.0))
       True
 
@@ -206,7 +206,7 @@ class Sphere:
 
 
 @_tree.component(static=("faces",))
-class Surface:
+class FromSurface:
     """Uniform on a surface of triangles (in space or in the plane).
 
         x = a + s (b - a) + q (c - a),   a triangle (a, b, c) drawn by its area
@@ -218,7 +218,7 @@ class Surface:
     Raises: ValueError, if faces is not (face, 3) or names a vertex that is not there.
     Example:
       >>> import jax, jeuler
-      >>> jeuler.Surface([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])(jax.random.key(0), 7).shape
+      >>> jeuler.FromSurface([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])(jax.random.key(0), 7).shape
       (7, 2)
 
     Source: R. Osada et al., Shape distributions, ACM Transactions on Graphics 21, 2002, sect. 4.2.
@@ -231,10 +231,10 @@ class Surface:
         _tree.store_as_float(self, "vertices")
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
-            raise ValueError(f"Surface.faces must be integers of shape (face, 3), got {faces.dtype} {faces.shape}")
+            raise ValueError(f"FromSurface.faces must be integers of shape (face, 3), got {faces.dtype} {faces.shape}")
         if faces.min() < 0 or faces.max() >= len(self.vertices):
             raise ValueError(
-                f"Surface.faces must be indices from 0 to {len(self.vertices) - 1}, "
+                f"FromSurface.faces must be indices from 0 to {len(self.vertices) - 1}, "
                 f"got from {faces.min()} to {faces.max()}"
             )
         object.__setattr__(self, "faces", tuple(map(tuple, faces.tolist())))
