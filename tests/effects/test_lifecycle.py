@@ -237,7 +237,7 @@ def test_bad_scenes_get_one_clear_error_before_tracing(name):
 
 
 def test_bad_arguments_get_one_clear_error():
-    with pytest.raises(ValueError, match="needs a key, because Emitter draws random numbers.*key=jax.random.key"):
+    with pytest.raises(ValueError, match=r"needs a key, because Emitter draws random numbers.*key=jax.random.key"):
         simulate(Scene(effects=(Emitter(1.0, **POINT),)), empty_pool(3, 2), dt=0.1, num_steps=1)
     for capacity in (0, -1, 2.5):
         with pytest.raises(ValueError, match="capacity must be"):

@@ -30,7 +30,7 @@ class Emitter:
 
     Args:
       rate: births a second, (), 1/s, >= 0.
-      position: where, a sampler ``(key, count) -> (count, dim)`` such as `FromSphere` or `FromLine`, or one point (dim,), m.
+      position: where, a sampler ``(key, count) -> (count, dim)`` such as `FromSphere`, or one point (dim,), m.
       velocity: how fast, a sampler such as `Cone` or `Normal`, or one vector (dim,), m/s.
       lifetime, mass, color, opacity, size, shape: what newborns get, a sampler or one value; None leaves the field
         out of the state, or at its default where another part of the scene has it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -25,9 +26,24 @@ def air_velocity(air: tuple, t: Any, position: Array) -> Array | float:
     return sum((part(t, position) for part in air), start=0.0)
 
 
-def at_time(x: Any, t: Any) -> Array:
+def at_time(x: Any, t: Any, dtype: Any = None) -> Array:
     """A place or strength that may be a function of time."""
-    return x(t) if callable(x) else x
+    return jnp.asarray(x(t) if callable(x) else x, dtype)
+
+
+def check_air(name: str, air: tuple, particles: int, dim: int) -> None:
+    """Each field of the air gives a velocity of the right dimension."""
+    t, position = jnp.zeros(()), jnp.zeros((particles, dim))
+    for part in air:
+        try:
+            shape = jax.eval_shape(part, t, position).shape
+        except (TypeError, ValueError) as error:
+            shape = str(error).splitlines()[0]
+        if shape != (particles, dim):
+            raise ValueError(
+                f"{name}.air must give a velocity of shape ({particles}, {dim}), (particle, dim); "
+                f"{type(part).__name__} gives {shape}"
+            )
 
 
 def moving(x: Any) -> Any:
@@ -56,7 +72,7 @@ class Wind:
         object.__setattr__(self, "velocity", moving(self.velocity))
 
     def __call__(self, t: Any, position: Array) -> Array:
-        return jnp.broadcast_to(at_time(self.velocity, t).astype(position.dtype), position.shape)
+        return jnp.broadcast_to(at_time(self.velocity, t, position.dtype), position.shape)
 
 
 @_tree.component()
@@ -126,12 +142,9 @@ class Turbulence:
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype
-        total = jnp.zeros_like(position)
-        for k, a, phase, f in zip(self.waves, self.amplitudes, self.phases, self.frequencies, strict=True):
-            angle = sum(position[:, c] * (k[c] / self.size) for c in range(position.shape[1]))
-            angle = angle + phase + f * t / self.time
-            total = total + jnp.cos(angle).astype(dtype)[:, None] * a.astype(dtype)
-        return (self.speed * jnp.sqrt(2 / len(self.waves))).astype(dtype) * total
+        waves, amplitudes = (self.waves / self.size).astype(dtype), self.amplitudes.astype(dtype)
+        angle = position @ waves.T + (self.phases + self.frequencies * t / self.time).astype(dtype)
+        return (self.speed * jnp.sqrt(2 / len(waves))).astype(dtype) * (jnp.cos(angle) @ amplitudes)
 
 
 def turbulence(
@@ -199,7 +212,7 @@ class Vortex:
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype
-        offset = position - at_time(self.center, t).astype(dtype)
+        offset = position - at_time(self.center, t, dtype)
         if position.shape[1] == 2:
             across = jnp.stack([-offset[:, 1], offset[:, 0]], axis=1)
         else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -48,12 +49,12 @@ class PointAttractor:
         _tree.store_as_float(self, "softening")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        d = at_time(self.center, t).astype(position.dtype) - position
+        d = at_time(self.center, t, position.dtype) - position
         square = jnp.sum(d * d, axis=1, keepdims=True) + self.softening.astype(position.dtype) ** 2
-        acceleration = at_time(self.strength, t).astype(position.dtype) * d * square ** (-(self.power + 1) / 2)
+        acceleration = at_time(self.strength, t, position.dtype) * d * square ** (-(self.power + 1) / 2)
         return per_particle(jnp.where(jnp.isfinite(mass), mass, 0)) * acceleration
 
     def check(self, particles: int, dim: int) -> None:
-        shape = jnp.shape(at_time(self.center, jnp.zeros(())))
+        shape = jax.eval_shape(at_time, self.center, jnp.zeros(())).shape
         if shape != (dim,):
             raise ValueError(f"PointAttractor.center must have shape ({dim},), got {shape}")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler import _tree
-from jeuler.forces.air import air_velocity, as_air
+from jeuler.forces.air import air_velocity, as_air, check_air
 from jeuler.forces.fields import per_particle
 
 
@@ -67,6 +67,7 @@ class LinearDrag:
 
     def check(self, particles: int, dim: int) -> None:
         check_coefficient("LinearDrag", self.coefficient, particles)
+        check_air("LinearDrag", self.air, particles, dim)
 
 
 @_tree.component()
@@ -117,6 +118,7 @@ class QuadraticDrag:
 
     def check(self, particles: int, dim: int) -> None:
         check_coefficient("QuadraticDrag", self.coefficient, particles)
+        check_air("QuadraticDrag", self.air, particles, dim)
 
 
 def check_coefficient(name: str, coefficient: Array, particles: int) -> None:

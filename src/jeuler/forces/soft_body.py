@@ -29,13 +29,15 @@ def rotation_of(a: Array) -> Array:
 def _rotation_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     (a,), (da,) = primals, tangents
     r = rotation_of(a)
-    s = r.T @ a
-    skew = r.T @ da - da.T @ r
-    one = jnp.eye(len(a), dtype=a.dtype)
-    small = jnp.finfo(a.dtype).eps * (1 + jnp.abs(jnp.trace(s)))  # keeps a collapsed body's derivative finite
+    return r, r @ turning(r.T @ a, r.T @ da - da.T @ r)
+
+
+def turning(s: Array, skew: Array) -> Array:
+    """The antisymmetric W with S W + W S = skew, for a symmetric S; finite also for a collapsed body, S = 0."""
+    one = jnp.eye(len(s), dtype=s.dtype)
+    small = jnp.finfo(s.dtype).eps * (1 + jnp.abs(jnp.trace(s)))
     both_sides = jnp.kron(s, one) + jnp.kron(one, s.T) + small * jnp.kron(one, one)
-    w = jnp.linalg.solve(both_sides, skew.reshape(-1)).reshape(s.shape)
-    return r, r @ w
+    return jnp.linalg.solve(both_sides, skew.reshape(-1)).reshape(s.shape)
 
 
 @_tree.component(static=("particles",))
@@ -43,10 +45,10 @@ class ShapeMatching:
     """A soft body: each particle is pulled to its place in the rest shape, moved and turned as the body is now.
 
         c = mean of p,   R = the rotation nearest to sum_i (p_i - c) q_i^T,   g_i = c + R q_i
-        F_i = stiffness (g_i - p_i) + damping (dg_i/dt - v_i)
+        F_i = stiffness (g_i - p_i) + damping (mean of v + W (p_i - c) - v_i)
 
-    with q the rest shape about its own mean. The forces sum to zero and have no torque. A collapsed or inverted body
-    finds back.
+    with q the rest shape about its own mean and W the turning of the body as it is, by least squares. The forces sum
+    to zero and have no torque. A collapsed or inverted body finds back.
 
     Args:
       particles: indices of the body, integers (body particle,). Static.
@@ -82,21 +84,19 @@ class ShapeMatching:
                 f"body's particles, got {self.rest_position.shape}"
             )
 
-    def goal(self, position: Array, here: Array) -> Array:
-        """The place of each particle of the body in the rest shape, moved and turned; ``here`` counts the living."""
-        count = jnp.maximum(jnp.sum(here), 1)
-        rest = self.rest_position.astype(position.dtype)
-        q = rest - jnp.sum(here * rest, axis=0) / count
-        c = jnp.sum(here * position, axis=0) / count
-        return c + q @ rotation_of((here * (position - c)).T @ q).T
-
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         body, dtype = np.asarray(self.particles), position.dtype
-        p, v = position[body], velocity[body]
-        here = jnp.ones((len(body), 1), dtype) if self.here is None else self.here[:, None].astype(dtype)
-        goal, goal_velocity = jax.jvp(lambda p: self.goal(p, here), (p,), (v,))
-        force = self.stiffness.astype(dtype) * (goal - p) + self.damping.astype(dtype) * (goal_velocity - v)
-        return jnp.zeros_like(position).at[body].add(here * force)
+        here = jnp.ones(len(body), dtype) if self.here is None else self.here.astype(dtype)
+        here = here[:, None]
+
+        def about_mean(x):
+            return here * (x - jnp.sum(here * x, axis=0) / jnp.maximum(jnp.sum(here), 1))
+
+        p, v, q = (about_mean(x) for x in (position[body], velocity[body], self.rest_position.astype(dtype)))
+        turn = turning(p.T @ p, v.T @ p - p.T @ v)
+        to_goal, to_rigid = q @ rotation_of(p.T @ q).T - p, p @ turn.T - v
+        force = self.stiffness.astype(dtype) * to_goal + self.damping.astype(dtype) * to_rigid
+        return jnp.zeros_like(position).at[body].add(force)
 
     def among(self, alive: Array) -> ShapeMatching:
         """The body of the living only."""
