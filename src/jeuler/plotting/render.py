@@ -15,6 +15,7 @@ from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 
+from jeuler.declare import declared
 from jeuler.plotting.solids import draw_collider
 from jeuler.state import ParticleState
 
@@ -78,6 +79,15 @@ def draw(
     view = View.of(camera, position[None], alive_of(frame)[None])
     Picture(ax, scene, view, frame, t).update(frame, t)
     return ax
+
+
+def save_picture(path: Any, frame: ParticleState, scene: Any = None, *, size: tuple = (6.0, 4.5), dpi: int = 80,
+                 background: Any = "white", **options: Any) -> None:  # fmt: skip
+    """Draw one moment to a file; ``options`` are those of `draw`."""
+    ax = new_axes(np.shape(frame.position)[-1], background, size)
+    draw(frame, scene, ax=ax, background=background, **options)
+    ax.figure.savefig(path, dpi=dpi, facecolor=background)
+    plt.close(ax.figure)
 
 
 def animate(
@@ -277,8 +287,9 @@ class Picture:
         position = np.asarray(frame.position)
         self.dim = position.shape[1]
         view.aim(ax, position, alive_of(frame), t)
-        self.colliders = [c for effect in getattr(scene, "effects", ()) for c in getattr(effect, "colliders", ())]
-        self.springs = [force for force in getattr(scene, "forces", ()) if hasattr(force, "rest_length")]
+        forces, effects = getattr(scene, "forces", ()), getattr(scene, "effects", ())
+        self.colliders = [collider for effect in effects for collider in declared(effect, "colliders")]
+        self.springs = [force for force in forces if hasattr(force, "rest_length")]
         self.lines = [self._new_lines() for _ in self.springs]
         self.dots: list[PathCollection] = []
         self.moving = any(callable(value) for c in self.colliders for value in vars(c).values())
