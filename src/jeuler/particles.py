@@ -29,7 +29,9 @@ class Scene:
     Args:
       forces: functions ``(t, position, velocity, mass) -> (particle, dim)`` in N, such as `Springs` and `Gravity`.
       effects: functions ``(t, dt, state, key) -> state``, applied at each step in this order: births and deaths
-        (`Emitter`, `Lifetime`, ...) before the motion, all others, such as `PrescribedMotion`, after it.
+        (`Emitter`, `Lifetime`, ...) before the motion, all others, such as `PrescribedMotion`, after it. One that needs
+        the state before the motion, such as `Collisions`, has a method ``over_step(t, dt, previous, state, key)``,
+        which is called instead.
     Raises: ValueError, in `simulate`, where a force or effect does not fit the state.
     Example:
       >>> import jax, jeuler
@@ -190,20 +192,23 @@ def simulate(
     _check_effects(scene, state, grid, key)
     advance = advance_by(step, compensated=compensated)
 
-    def apply(n, t, state, *, before_motion):
+    def apply(n, t, previous, state, *, before_motion):
         for index, effect in enumerate(scene.effects):
             if declared(effect, "before_motion", False) == before_motion:
                 own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, n), index)
-                state = effect(t, grid.dt, state, own_key)
+                if hasattr(effect, "over_step"):
+                    state = effect.over_step(t, grid.dt, previous, state, own_key)
+                else:
+                    state = effect(t, grid.dt, state, own_key)
         return state
 
     def next_state(n, t, state_and_lost):
         state, lost = state_and_lost
-        state = apply(n, t, state, before_motion=True)
-        motion = state.position, state.velocity
-        (position, velocity), lost = advance(field, t, (motion, lost), grid.dt, scene.attributes(state))
-        state = _tree.replace(state, position=position, velocity=velocity)
-        state = apply(n, grid.clock(n + 1), state, before_motion=False)
+        previous = apply(n, t, state, state, before_motion=True)
+        motion = previous.position, previous.velocity
+        (position, velocity), lost = advance(field, t, (motion, lost), grid.dt, scene.attributes(previous))
+        state = _tree.replace(previous, position=position, velocity=velocity)
+        state = apply(n, grid.clock(n + 1), previous, state, before_motion=False)
         return state if state.alive is None else parked(state), lost
 
     start = state, no_loss(motion, compensated)

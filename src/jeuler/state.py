@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
@@ -124,12 +125,13 @@ class ParticleState:
             )
         if self.mass.shape not in ((), shape[:1]):
             raise ValueError(f"state.mass must have shape () or {shape[:1]}, one a particle, got {self.mass.shape}")
-        if not _check.is_traced(self.mass) and not bool(jnp.all(self.mass > 0)):
-            worst = int(jnp.argmin(jnp.where(self.mass > 0, jnp.inf, 0)))
-            raise ValueError(
-                f"state.mass must be greater than 0 kg (inf pins a particle), got {self.mass.ravel()[worst]} "
-                f"at particle {worst}"
-            )
+        if not _check.is_traced(self.mass):
+            mass = np.asarray(self.mass).ravel()
+            bad = np.flatnonzero(~(mass > 0))
+            if bad.size:
+                raise ValueError(
+                    f"state.mass must be greater than 0 kg (inf pins a particle), got {mass[bad[0]]} at particle {bad[0]}"
+                )
         self._check_fields(shape[0])
 
     def _check_fields(self, particles: int) -> None:

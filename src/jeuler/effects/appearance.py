@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
@@ -53,7 +54,7 @@ class OverLife:
             raise ValueError(
                 f"OverLife.times must have one time for each of the {len(self.values)} values, got {self.times.shape}"
             )
-        if self.times is not None and not _check.is_traced(self.times) and not bool((jnp.diff(self.times) > 0).all()):
+        if self.times is not None and not _check.is_traced(self.times) and not (np.diff(np.asarray(self.times)) > 0).all():
             raise ValueError(f"OverLife.times must increase, got {self.times.tolist()}")
         if self.duration is not None:
             _check.positive("OverLife.duration", self.duration, "s")
@@ -129,7 +130,7 @@ class SpeedLimit:
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "limit")
-        if not _check.is_traced(self.limit) and not bool((self.limit >= 0).all()):
+        if not _check.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {self.limit.min()}")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
