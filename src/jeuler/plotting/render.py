@@ -16,7 +16,7 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 
 from jeuler.declare import declared
-from jeuler.plotting.solids import draw_collider
+from jeuler.plotting.solids import draw_collider, in_sight
 from jeuler.state import ParticleState
 
 MARKERS = ("o", "s", "^", "D", "*")  # by state.shape
@@ -201,7 +201,7 @@ class Film:
                 picture = picture or Picture(ax, self.scene, view, frame, times[n])
                 picture.update(frame, float(times[n]))
                 if self.title:
-                    ax.set_title(self.title.format(t=f"{times[n]:.2f}"))
+                    ax.figure.suptitle(self.title.format(t=f"{times[n]:.2f}"), y=0.97)
                 yield
 
         return ax.figure, frames()
@@ -227,11 +227,18 @@ def alive_of(state: ParticleState) -> np.ndarray:
 def new_axes(dim: int, background: Any, size: tuple = (6.0, 4.5)) -> Any:
     """Axes without a frame, that keep what is round round."""
     figure = plt.figure(figsize=size, facecolor=background)
-    ax = figure.add_axes((0.0, 0.0, 1.0, 0.94), projection="3d" if dim == 3 else None)
+    if dim == 3:  # axes in space are square: let the square cover the whole picture
+        square = max(size) / np.array(size)
+        ax = figure.add_axes((*(1 - square) / 2, *square), projection="3d")
+    else:
+        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set_facecolor(background)
     ax.set_axis_off()
     if dim == 2:
         ax.set_aspect("equal", adjustable="box")
+    else:
+        ax.set_proj_type("ortho")
+        ax.computed_zorder = False  # solids first; what they hide is left out (`in_sight`)
     return ax
 
 
@@ -266,17 +273,35 @@ class View:
         ax.set_ylim(*limits[:, 1])
         if len(center) == 3:
             ax.set_zlim(*limits[:, 2])
-            ax.set_box_aspect(self.half, zoom=1.25)
             azimuth = camera.azimuth(t) if callable(camera.azimuth) else camera.azimuth
             ax.view_init(elev=camera.elevation, azim=azimuth)
+            ax.set_box_aspect(tuple(self.half))
+            width, height = 72 * ax.figure.get_size_inches()
+            wanted = width / (2 * self.half[:2].max())
+            if camera.width is None:
+                wanted = min(wanted, height / (2 * self.half[2] + self.half[:2].max() * np.sin(np.radians(camera.elevation))))
+            ax.set_box_aspect(tuple(self.half), zoom=float(wanted / self.points_a_metre(ax)))
+        ax.autoscale(False)
+
+    def toward_viewer(self, t: float) -> np.ndarray:
+        """The unit vector from the scene to the camera."""
+        azimuth = self.camera.azimuth(t) if callable(self.camera.azimuth) else self.camera.azimuth
+        a, e = np.radians(azimuth), np.radians(self.camera.elevation)
+        return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
     def points_a_metre(self, ax: Any) -> float:
-        """How long a metre is in the picture, in points."""
-        box = ax.get_window_extent()
-        dpi = ax.figure.dpi
+        """How long a metre across the view is in the picture, in points."""
         if len(self.half) == 2:
-            return min(box.width / (2 * self.half[0]), box.height / (2 * self.half[1])) * 72 / dpi
-        return 0.62 * min(box.width, box.height) / (2 * self.half.max()) * 72 / dpi * 1.25
+            ends = np.array([self.center, self.center + [1, 0]])
+        else:
+            from mpl_toolkits.mplot3d import proj3d
+
+            x, y, _ = self.toward_viewer(0.0)
+            across = np.array([-y, x, 0.0]) / np.hypot(x, y)
+            ends = np.stack([self.center, self.center + across])
+            ends = np.stack(proj3d.proj_transform(*ends.T, ax.get_proj())[:2], axis=1)
+        a, b = ax.transData.transform(ends)
+        return float(np.hypot(*(b - a))) * 72 / ax.figure.dpi
 
 
 class Picture:
@@ -313,6 +338,9 @@ class Picture:
         self.view.aim(self.ax, position, alive, t)
         if self.moving:
             self._draw_solids(t)
+        if self.dim == 3 and self.colliders:
+            toward = self.view.toward_viewer(t)
+            alive = alive & in_sight(self.colliders, t, position, toward, 2 * self.view.half.max())
         for force, lines in zip(self.springs, self.lines, strict=True):
             edges = np.asarray(force.edges)
             edges = edges[alive[edges].all(axis=1)]

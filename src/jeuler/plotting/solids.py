@@ -1,4 +1,4 @@
-"""Colliders as a picture shows them: planes, spheres and boxes by their own shape, all others by where distance is 0."""
+"""Colliders as a picture shows them: spheres and boxes by their own shape, all others by where distance is 0."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jeuler import _tree
 
 FILL, EDGE = "#d9d4c7", "#8a8578"
 
@@ -18,8 +20,22 @@ def draw_collider(ax: Any, collider: Any, t: float, center: np.ndarray, half: np
 
 def distances(collider: Any, t: float, points: np.ndarray) -> np.ndarray:
     """The distance at points (..., dim)."""
+    collider = _tree.as_component(collider)
     flat = jnp.asarray(points.reshape(-1, points.shape[-1]))
-    return np.asarray(jax.vmap(lambda p: collider(jnp.asarray(t, flat.dtype), p))(flat)).reshape(points.shape[:-1])
+    return np.asarray(_distances(collider, jnp.asarray(t, flat.dtype), flat)).reshape(points.shape[:-1])
+
+
+@jax.jit
+def _distances(collider: Any, t: Any, points: Any) -> Any:
+    return jax.vmap(collider, (None, 0))(t, points)
+
+
+def in_sight(colliders: list, t: float, position: np.ndarray, toward: np.ndarray, far: float) -> np.ndarray:
+    """Which particles no solid hides from a viewer in the direction ``toward``: (particle,), by steps along the ray."""
+    steps = far * np.linspace(0.01, 1.0, 40) ** 1.5
+    ray = np.nan_to_num(position)[:, None] + steps[:, None] * toward
+    nearest = np.min([distances(collider, t, ray).min(axis=1) for collider in colliders], axis=0)
+    return nearest > -0.002 * far
 
 
 def _in_plane(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
@@ -74,7 +90,7 @@ def _box(ax: Any, middle: np.ndarray, half: np.ndarray) -> list[Any]:
 
 def _height(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
     """The upper side of any other solid: for each place (x, y), the highest z at which the distance is 0."""
-    x, y = (np.linspace(center[k] - half[k], center[k] + half[k], 48) for k in range(2))
+    x, y = (np.linspace(center[k] - 1.5 * half[k], center[k] + 1.5 * half[k], 60) for k in range(2))
     z = np.linspace(center[2] - 1.3 * half[2], center[2] + 1.3 * half[2], 96)
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
     d = distances(collider, t, points)

@@ -52,13 +52,14 @@ def curly_hair(strands: int = 36, nodes: int = 36, coils: float = 4.0) -> Setup:
     forces = (
         DOWN,
         Springs(edges, ks=1500.0, kd=0.3, rest_length=length),
-        StrandBending(index, rest, stiffness=25.0, damping=0.05, smoothing=0.25),
-        StrandCore(index, rest, stiffness=60.0, damping=0.15, smoothing=0.25),
-        LinearDrag(0.01),
+        StrandBending(index, rest, stiffness=60.0, damping=0.05, smoothing=0.25),
+        StrandCore(index, rest, stiffness=200.0, damping=0.1, smoothing=0.25),
+        LinearDrag(0.003),
     )
     effects = (PrescribedMotion(roots, lambda t: start + nod(t)), Collisions((head,), friction=0.2))
-    state = ParticleState(flat, 0 * flat, mass=0.01)
-    camera = {"center": [0.0, 0.0, -0.15], "width": 1.25, "elevation": 6.0}
+    brown = np.repeat(random.uniform(0.7, 1.3, (strands, 1)) * [[0.42, 0.24, 0.12]], nodes, axis=0)
+    state = ParticleState(flat, 0 * flat, mass=0.003, color=brown, size=np.full(len(flat), 0.012))
+    camera = {"center": [0.0, 0.0, -0.12], "width": 1.3, "elevation": 6.0}
     return Setup(Scene(forces, effects), state, 5e-4, 4000, 40, camera)
 
 
@@ -95,15 +96,16 @@ def jelly_on_stairs(side: int = 6) -> Setup:
     i, j = np.nonzero(np.triu(np.isclose(apart, 0.16)) & surface[:, None] & surface)
     tilt = np.array([[0.8, 0.0, 0.6], [0.36, 0.8, -0.48], [-0.48, 0.6, 0.64]])
     start = cube @ tilt.T + [-1.3, 0.0, 1.5]
-    stairs = tuple(Box([-1.5 + 0.9 * k, 0.0, -0.45 * k - 1.0], [0.45, 1.3, 1.0]) for k in range(5))
+    stairs = tuple(Box([-1.5 + 0.9 * k, 0.0, -0.45 * k - 1.0], [0.45, 1.4, 1.0]) for k in range(3))
+    landing = Box([2.4, 0.0, -2.35], [1.65, 1.4, 1.0])
     forces = (
         DOWN,
         ShapeMatching(range(side**3), cube, stiffness=120.0, damping=0.6),
         Springs(np.stack([i, j], axis=1), ks=60.0, kd=0.2, rest_length=0.16),
     )
-    velocity = np.tile([1.6, 0.0, 0.0], (side**3, 1))
-    contact = Collisions(stairs, restitution=0.2, friction=0.25)
+    velocity = np.tile([0.9, 0.0, 0.0], (side**3, 1))
+    contact = Collisions((*stairs, landing), restitution=0.2, friction=0.25)
     color = np.where(surface[:, None], [0.85, 0.2, 0.45], [0.95, 0.5, 0.6])
     state = ParticleState(start, velocity, mass=0.05, color=color, size=np.full(side**3, 0.09))
-    camera = {"center": [0.2, 0.0, -0.6], "width": 4.2, "azimuth": -70.0, "elevation": 14.0}
-    return Setup(Scene(forces, (contact,)), state, 2e-3, 1250, 25, camera)
+    camera = {"center": [1.1, 0.0, -0.5], "width": 6.4, "azimuth": -70.0, "elevation": 14.0}
+    return Setup(Scene(forces, (contact,)), state, 2e-3, 1000, 20, camera)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler.colliders import Sphere
 from jeuler.declare import uses
 from jeuler.effects import SpeedLimit
 from jeuler.forces import PointAttractor
@@ -36,12 +38,15 @@ def run_to_goal(t, position, velocity, mass):
 def keep_apart(t, position, velocity, mass):
     """Away from where it is crowded: down the slope of the number of agents per cell, on a grid of 1.5 m."""
     cell, cells = 1.5, 96
-    place = position[:, :2] / cell + cells / 2
+    place = position[:, :2].T / cell + cells / 2
     corner = jnp.clip(jnp.floor(place).astype(int), 0, cells - 2)
-    crowd = jnp.zeros((cells, cells), position.dtype).at[corner[:, 0], corner[:, 1]].add(1.0)
-    crowd = (crowd + sum(jnp.roll(crowd, shift, axis) for shift in (-1, 1) for axis in (0, 1))) / 5
-    slope = jnp.stack(jnp.gradient(crowd), axis=-1)[corner[:, 0], corner[:, 1]]
-    return jnp.pad(-2.5 * slope, ((0, 0), (0, 1)))
+    part = place - corner
+    crowd = jnp.zeros((cells, cells), position.dtype)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # each agent counts at the four corners of its cell
+        share = jnp.abs(1 - i - part[0]) * jnp.abs(1 - j - part[1])
+        crowd = crowd.at[corner[0] + i, corner[1] + j].add(share)
+    slope = [jax.scipy.ndimage.map_coordinates(x, list(place), order=1) for x in jnp.gradient(crowd)]
+    return jnp.stack([-2.5 * slope[0], -2.5 * slope[1], jnp.zeros(len(position), position.dtype)], axis=1)
 
 
 @uses(sets=("color",))
@@ -54,7 +59,8 @@ def on_the_ground(t, dt, state, key):
     return state.replace(position=position, velocity=v.at[:, 2].set(0.0), color=slow + speed * (fast - slow))
 
 
-on_the_ground.colliders = (land,)  # type: ignore[attr-defined]  # drawn with the scene
+ROCK_SOLIDS = tuple(Sphere([x, y, float(height(x, y))], 2.0) for x, y in ROCKS)
+on_the_ground.colliders = (land, *ROCK_SOLIDS)  # type: ignore[attr-defined]  # drawn with the scene
 
 
 def charge(agents: int = 5000) -> Setup:

@@ -19,7 +19,7 @@ def fountain() -> Setup:
     jet = Emitter(
         rate=1500.0,
         position=FromDisc([0.0, 0.0, 0.1], radius=0.06),
-        velocity=Cone([0.0, 0.0, 1.0], speed=Uniform(7.0, 8.0), angle=0.16),
+        velocity=Cone([0.0, 0.0, 1.0], speed=Uniform(6.4, 7.2), angle=0.14),
         lifetime=Uniform(2.2, 2.8),
         max_births=40,
     )
@@ -28,8 +28,8 @@ def fountain() -> Setup:
     blue = OverLife("color", [[0.95, 0.98, 1.0], [0.45, 0.7, 0.95], [0.2, 0.4, 0.8]])
     fade = OverLife("opacity", [0.95, 0.7, 0.0], times=[0.0, 0.8, 1.0])
     grow = OverLife("size", [0.035, 0.06])
-    scene = Scene((Gravity([0.0, 0.0, -9.81]), LinearDrag(0.35, air=air)), (jet, Lifetime(), ground, blue, fade, grow))
-    camera = {"center": [0.6, 0.0, 1.4], "width": 4.2, "azimuth": -80.0, "elevation": 10.0}
+    scene = Scene((Gravity([0.0, 0.0, -9.81]), LinearDrag(0.15, air=air)), (jet, Lifetime(), ground, blue, fade, grow))
+    camera = {"center": [0.5, 0.0, 1.2], "width": 5.0, "azimuth": -80.0, "elevation": 10.0}
     return Setup(scene, empty_pool(4000, dim=3), 0.02, 200, 2, camera, background="#10151f")
 
 
@@ -54,7 +54,7 @@ def smoke_column() -> Setup:
     fade = OverLife("opacity", [0.5, 0.3, 0.0], times=[0.0, 0.3, 1.0])
     spread = OverLife("size", [0.06, 0.16, 0.5], times=[0.0, 0.3, 1.0])
     scene = Scene((buoyancy, LinearDrag(2.0, air=air)), (fire, Lifetime(), glow, fade, spread))
-    camera = {"center": [0.0, 0.0, 2.2], "width": 5.0, "elevation": 8.0}
+    camera = {"center": [0.0, 0.0, 2.6], "width": 6.6, "elevation": 8.0}
     return Setup(scene, empty_pool(4000, dim=3), 0.02, 250, 2, camera, background="#15171c")
 
 
@@ -67,13 +67,13 @@ def rain_on_pegs(rows: int = 9, spacing: float = 0.2) -> Setup:
         def to_peg(row):
             row = jnp.clip(row, 1, rows)
             x = jnp.mod(point[0] / spacing + row / 2, 1.0) - 0.5
-            return jnp.hypot(x * spacing, point[1] - row * spacing) - 0.028
+            return jnp.hypot(x * spacing, point[1] - row * spacing) - 0.03
 
         return jnp.minimum(to_peg(row), jnp.minimum(to_peg(row - 1), to_peg(row + 1)))
 
     top = (rows + 2) * spacing
     cloud = Emitter(
-        rate=150.0,
+        rate=400.0,
         position=FromLine([-0.03, top], [0.03, top]),
         velocity=Normal([0.0, -0.5], 0.1),
         color=Uniform([0.1, 0.3, 0.6], [0.3, 0.6, 0.95]),
@@ -84,5 +84,5 @@ def rain_on_pegs(rows: int = 9, spacing: float = 0.2) -> Setup:
     scene = Scene(
         (Gravity([0.0, -9.81]), LinearDrag(1.5)), (cloud, DeathOutside([-2.0, -0.5], [2.0, 4.0]), contact)
     )
-    camera = {"center": [0.0, 0.85], "width": 3.2}
-    return Setup(scene, empty_pool(500, dim=2), 0.005, 1000, 8, camera)
+    camera = {"center": [0.0, 0.9], "width": 2.8}
+    return Setup(scene, empty_pool(1200, dim=2), 0.005, 1000, 8, camera)
