@@ -19,7 +19,7 @@ from jeuler.forces import LinearDrag
 from jeuler.state import empty_pool
 
 ALIVE, STEPS, DT, REPEATS = 5_000, 6_000, 0.01, 7
-WINDOWS = (6_144, 16_384, 65_536)
+WINDOWS = (7_168, 16_384, 65_536)
 
 
 def scene(lifetime: float, rate: float, burst: int) -> Scene:
@@ -29,7 +29,7 @@ def scene(lifetime: float, rate: float, burst: int) -> Scene:
         "velocity": Cone([0.0, 0.0, 1.0], Uniform(5.0, 7.0), 0.2),
         "lifetime": Uniform(0.9 * lifetime, 1.1 * lifetime),
     }
-    stream = Emitter(rate, **drops, max_births=64)
+    stream = Emitter(rate, **drops, max_births=50)
     first = (Emitter(0.0, **drops, bursts=((0.0, burst),), max_births=burst, stop=DT),) if burst else ()
     forces = (Gravity([0.0, 0.0, -9.81]), LinearDrag(0.3, air=[2.0, 0.0, 0.0]))
     return Scene(forces, (*first, stream, Lifetime(), OverLife("opacity", [1.0, 0.0])))
@@ -40,7 +40,7 @@ def program(capacity: int, scene: Scene, windows: tuple[int, ...] = ()):
 
     def end(scene, pool, key):
         solution = simulate(
-            scene, pool, dt=DT, num_steps=STEPS, save_every=100, key=key, windows=windows, step=symplectic_euler_step,
+            scene, pool, dt=DT, num_steps=STEPS, save_every=25, key=key, windows=windows, step=symplectic_euler_step,
             save=lambda t, state: (state.births, state.missed_births, state.alive.sum()),
         )  # fmt: skip
         return solution.y

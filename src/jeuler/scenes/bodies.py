@@ -60,7 +60,7 @@ def curly_hair(strands: int = 36, nodes: int = 36, coils: float = 4.0) -> Setup:
     brown = np.repeat(random.uniform(0.7, 1.3, (strands, 1)) * [[0.42, 0.24, 0.12]], nodes, axis=0)
     state = ParticleState(flat, 0 * flat, mass=0.003, color=brown, size=np.full(len(flat), 0.012))
     camera = {"center": [0.0, 0.0, -0.12], "width": 1.3, "elevation": 6.0}
-    return Setup(Scene(forces, effects), state, 5e-4, 4000, 40, camera)
+    return Setup(Scene(forces, effects), state, 5e-4, 4000, 40, camera, frame=25)
 
 
 def cloth_on_sphere(side: int = 32) -> Setup:
@@ -108,4 +108,4 @@ def jelly_on_stairs(side: int = 6) -> Setup:
     color = np.where(surface[:, None], [0.85, 0.2, 0.45], [0.95, 0.5, 0.6])
     state = ParticleState(start, velocity, mass=0.05, color=color, size=np.full(side**3, 0.09))
     camera = {"center": [1.1, 0.0, -0.5], "width": 6.4, "azimuth": -70.0, "elevation": 14.0}
-    return Setup(Scene(forces, (contact,)), state, 2e-3, 1000, 20, camera)
+    return Setup(Scene(forces, (contact,)), state, 2e-3, 1000, 20, camera, frame=22)

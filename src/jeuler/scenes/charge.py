@@ -76,4 +76,4 @@ def charge(agents: int = 5000) -> Setup:
     scene = Scene((run_to_goal, keep_apart, *rocks), (SpeedLimit(limit), on_the_ground))
     state = ParticleState(position, 0 * position, size=np.full(agents, 0.55))
     camera = {"center": [0.0, 0.0, 0.0], "width": 90.0, "elevation": 32.0, "azimuth": -62.0}
-    return Setup(scene, state, 0.05, 240, 4, camera)
+    return Setup(scene, state, 0.05, 240, 4, camera, frame=32)

@@ -22,6 +22,7 @@ class Setup:
       dt, num_steps, save_every: how it takes them, dt in s.
       camera: named arguments of a ``plotting.render.Camera``.
       background: colour of the picture.
+      frame: the saved state that makes the best picture.
       step: the method.
     """
 
@@ -32,6 +33,7 @@ class Setup:
     save_every: int
     camera: dict[str, Any] = dataclasses.field(default_factory=dict)
     background: str = "white"
+    frame: int = -1
     step: Any = symplectic_euler_step
 
     def run(self, seed: int = 0, **changes: Any) -> Solution:
@@ -49,11 +51,14 @@ class Setup:
         look = {"camera": Camera(**self.camera), "background": self.background}
         return animate(self.run(), self.scene, path, **(look | options))
 
-    def picture(self, path: Any, frame: int = -1, solution: Solution | None = None, **options: Any) -> None:
+    def picture(
+        self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any
+    ) -> None:
         """A picture of one saved state of the run, written to the path."""
         from jeuler.plotting.render import Camera, save_picture
 
         solution = self.run() if solution is None else solution
+        frame = self.frame if frame is None else frame
         state = jax.tree.map(lambda x: x[frame], solution.y)
         look = {"camera": Camera(**self.camera), "background": self.background, "t": float(solution.t[frame])}
         save_picture(path, state, self.scene, **(look | options))
