@@ -8,14 +8,13 @@ import pytest
 from jeuler import scenes
 
 # fewer steps than the film has: long enough to see the point
-SHORT = {"fountain": 60, "smoke_column": 60, "cloth_on_sphere": 450, "charge": 80, "rain_on_pegs": 240}
+SHORT = {"fountain": 48, "smoke_column": 60, "cloth_on_sphere": 450, "charge": 80, "rain_on_pegs": 160}
 
 
 def run(name, **changes):
     setup = getattr(scenes, name)(**changes)
     steps = SHORT.get(name, setup.num_steps)
-    with jax.enable_x64(False):
-        solution = setup.run(num_steps=steps, save_every=steps // 4)
+    solution = setup.run(num_steps=steps, save_every=steps // 4)
     assert int(solution.first_nonfinite) == -1
     return setup, solution.y
 
@@ -39,7 +38,7 @@ def test_smoke_rises_turns_and_fades():
 
 def test_curls_keep_their_length_and_their_curl():
     setup, y = run("curly_hair", strands=4)
-    springs, bend, core = setup.scene.forces[1:4]
+    springs, *_ = setup.scene.forces[1:4]
     end = np.asarray(y.position[-1])
     edges = np.asarray(springs.edges)
     length = np.linalg.norm(end[edges[:, 0]] - end[edges[:, 1]], axis=1)
@@ -76,12 +75,12 @@ def test_the_crowd_advances_within_its_speed_limit_and_goes_around_the_rocks():
 
 
 def test_the_rain_spreads_like_galton_and_never_enters_a_peg():
-    setup, y = run("rain_on_pegs")
+    setup, y = run("rain_on_pegs", rows=5)
     alive = np.asarray(y.alive[-1])
     x = jnp.asarray(y.position[-1])[alive]
     distance = jax.vmap(setup.scene.effects[2].colliders[0], (None, 0))(0.0, x)
     assert float(distance.min()) > 0.012 - 2e-3
-    upper, lower = x[x[:, 1] > 1.4], x[x[:, 1] < 0.8]
+    upper, lower = x[x[:, 1] > 1.0], x[x[:, 1] < 0.6]
     assert len(lower) > 20
     assert np.std(lower[:, 0]) > 1.5 * np.std(upper[:, 0])
     assert abs(np.mean(lower[:, 0])) < 3 * np.std(lower[:, 0]) / np.sqrt(len(lower)) + 0.05

@@ -54,7 +54,11 @@ class OverLife:
             raise ValueError(
                 f"OverLife.times must have one time for each of the {len(self.values)} values, got {self.times.shape}"
             )
-        if self.times is not None and not _check.is_traced(self.times) and not (np.diff(np.asarray(self.times)) > 0).all():
+        if (
+            self.times is not None
+            and not _check.is_traced(self.times)
+            and not (np.diff(np.asarray(self.times)) > 0).all()
+        ):
             raise ValueError(f"OverLife.times must increase, got {self.times.tolist()}")
         if self.duration is not None:
             _check.positive("OverLife.duration", self.duration, "s")

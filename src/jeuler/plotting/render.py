@@ -193,7 +193,7 @@ class Film:
         view = View.of(self.camera, state.position, alive_of(state))
 
         def frames() -> Iterator[None]:
-            from tqdm.auto import tqdm
+            from tqdm import tqdm
 
             picture = None
             for n in tqdm(range(len(times)), desc="drawing", unit="frame", disable=not self.progress):
@@ -279,7 +279,9 @@ class View:
             width, height = 72 * ax.figure.get_size_inches()
             wanted = width / (2 * self.half[:2].max())
             if camera.width is None:
-                wanted = min(wanted, height / (2 * self.half[2] + self.half[:2].max() * np.sin(np.radians(camera.elevation))))
+                wanted = min(
+                    wanted, height / (2 * self.half[2] + self.half[:2].max() * np.sin(np.radians(camera.elevation)))
+                )
             ax.set_box_aspect(tuple(self.half), zoom=float(wanted / self.points_a_metre(ax)))
         ax.autoscale(False)
 
@@ -330,7 +332,9 @@ class Picture:
     def _draw_solids(self, t: float) -> None:
         for artist in self.solids:
             artist.remove()
-        self.solids = [a for c in self.colliders for a in draw_collider(self.ax, c, t, self.view.center, self.view.half)]
+        self.solids = [
+            a for c in self.colliders for a in draw_collider(self.ax, c, t, self.view.center, self.view.half)
+        ]
 
     def update(self, frame: ParticleState, t: float) -> None:
         """Show another frame."""
@@ -368,7 +372,12 @@ class Picture:
             here = alive & (shape == marker)
             artists.append(
                 self.ax.scatter(
-                    *position[here].T, s=points[here] ** 2, c=rgba[here], marker=MARKERS[marker], linewidths=0, zorder=3,
+                    *position[here].T,
+                    s=points[here] ** 2,
+                    c=rgba[here],
+                    marker=MARKERS[marker],
+                    linewidths=0,
+                    zorder=3,
                     **({"depthshade": False} if self.dim == 3 else {}),
                 )  # fmt: skip
             )

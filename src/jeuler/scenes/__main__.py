@@ -4,6 +4,7 @@ import pathlib
 import sys
 
 import matplotlib
+from PIL import Image
 
 from jeuler import scenes
 
@@ -16,8 +17,10 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     names = sys.argv[2:] or [scene.__name__ for scene in scenes.ALL]
     for name in names:
-        getattr(scenes, name)().picture(folder / f"{name}.png")
-        print(folder / f"{name}.png")
+        path = folder / f"{name}.png"
+        getattr(scenes, name)().picture(path)
+        Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
+        print(path)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from jeuler.state import ParticleState
 DOWN = Gravity([0.0, 0.0, -9.81])
 
 
-def curly_hair(strands: int = 36, nodes: int = 36, coils: float = 4.0) -> Setup:
+def curly_hair(strands: int = 64, nodes: int = 40, coils: float = 4.0) -> Setup:
     """Curls on a head that moves to and fro: stretch, bending and core springs on each strand."""
     random = np.random.default_rng(2)
     around = np.linspace(0, 2 * np.pi, strands, endpoint=False) + random.uniform(-0.05, 0.05, strands)
@@ -35,7 +35,7 @@ def curly_hair(strands: int = 36, nodes: int = 36, coils: float = 4.0) -> Setup:
     out = np.stack([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)], axis=1)
     s = np.linspace(0, 1, nodes)[None, :, None]
     turn = 2 * np.pi * coils * s + random.uniform(0, 2 * np.pi, (strands, 1, 1))
-    swell = 0.045 * np.minimum(1, 4 * s)
+    swell = 0.05 * np.minimum(1, 4 * s)
     drape = 0.30 * out[:, None] + 0.10 * s * out[:, None] * [1, 1, 0] - [0, 0, 0.62] * s
     rest = drape + swell * np.concatenate([np.cos(turn), np.sin(turn), 0 * turn], axis=2)
     index = np.arange(strands * nodes).reshape(strands, nodes)
@@ -58,9 +58,9 @@ def curly_hair(strands: int = 36, nodes: int = 36, coils: float = 4.0) -> Setup:
     )
     effects = (PrescribedMotion(roots, lambda t: start + nod(t)), Collisions((head,), friction=0.2))
     brown = np.repeat(random.uniform(0.7, 1.3, (strands, 1)) * [[0.42, 0.24, 0.12]], nodes, axis=0)
-    state = ParticleState(flat, 0 * flat, mass=0.003, color=brown, size=np.full(len(flat), 0.012))
-    camera = {"center": [0.0, 0.0, -0.12], "width": 1.3, "elevation": 6.0}
-    return Setup(Scene(forces, effects), state, 5e-4, 4000, 40, camera, frame=25)
+    state = ParticleState(flat, 0 * flat, mass=0.003, color=brown, size=np.full(len(flat), 0.009))
+    camera = {"center": [0.0, 0.0, -0.16], "width": 1.6, "elevation": 6.0}
+    return Setup(Scene(forces, effects), state, 5e-4, 4000, 40, camera, frame=-1)
 
 
 def cloth_on_sphere(side: int = 32) -> Setup:
@@ -83,14 +83,18 @@ def cloth_on_sphere(side: int = 32) -> Setup:
         Bending(lines, stiffness=1e-4),
         LinearDrag(0.004, air=air),
     )
-    ball = Collisions((Sphere([0.0, 0.0, 0.0], 0.6), Plane([0.0, 0.0, -0.8], [0.0, 0.0, 1.0])), radius=0.02, friction=0.5)
+    ball = Collisions(
+        (Sphere([0.0, 0.0, 0.0], 0.6), Plane([0.0, 0.0, -0.8], [0.0, 0.0, 1.0])), radius=0.02, friction=0.5
+    )
     camera = {"center": [0.0, 0.0, 0.0], "width": 2.4, "elevation": 22.0}
     return Setup(Scene(forces, (ball,)), ParticleState(cloth, 0 * cloth, mass=0.004), 1e-3, 1500, 15, camera)
 
 
 def jelly_on_stairs(side: int = 6) -> Setup:
     """A cube of jelly that tumbles down stairs and keeps its shape."""
-    cube = 0.16 * (np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) - (side - 1) / 2)
+    cube = 0.16 * (
+        np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) - (side - 1) / 2
+    )
     apart = np.linalg.norm(cube[:, None] - cube[None], axis=-1)
     surface = np.abs(cube).max(axis=1) > 0.16 * (side - 1) / 2 - 1e-6
     i, j = np.nonzero(np.triu(np.isclose(apart, 0.16)) & surface[:, None] & surface)

@@ -14,7 +14,7 @@ from jeuler.particles import Scene
 from jeuler.scenes.setup import Setup
 from jeuler.state import ParticleState
 
-GOAL = jnp.array([60.0, 0.0])
+GOAL = np.array([60.0, 0.0])
 ROCKS = ((5.0, 6.0), (14.0, -9.0), (26.0, 2.0))
 
 

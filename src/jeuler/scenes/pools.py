@@ -81,8 +81,6 @@ def rain_on_pegs(rows: int = 9, spacing: float = 0.2) -> Setup:
         max_births=4,
     )
     contact = Collisions((pegs,), radius=0.012, restitution=0.35, friction=0.05)
-    scene = Scene(
-        (Gravity([0.0, -9.81]), LinearDrag(1.5)), (cloud, DeathOutside([-2.0, -0.5], [2.0, 4.0]), contact)
-    )
+    scene = Scene((Gravity([0.0, -9.81]), LinearDrag(1.5)), (cloud, DeathOutside([-2.0, -0.5], [2.0, 4.0]), contact))
     camera = {"center": [0.0, 0.9], "width": 2.8}
     return Setup(scene, empty_pool(1200, dim=2), 0.005, 1000, 8, camera)

@@ -51,9 +51,7 @@ class Setup:
         look = {"camera": Camera(**self.camera), "background": self.background}
         return animate(self.run(), self.scene, path, **(look | options))
 
-    def picture(
-        self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any
-    ) -> None:
+    def picture(self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any) -> None:
         """A picture of one saved state of the run, written to the path."""
         from jeuler.plotting.render import Camera, save_picture
 
