@@ -10,8 +10,9 @@ from jeuler.forces import LinearDrag
 from jeuler.state import empty_pool
 
 JET = Emitter(
-    200.0, FromDisc([0.0, 0.0], 0.1), Cone([0.0, 1.0], Uniform(4.0, 6.0), 0.2), lifetime=Uniform(0.1, 0.4), max_births=4,
+    200.0, FromDisc([0.0, 0.0], 0.1), Cone([0.0, 1.0], Uniform(4.0, 6.0), 0.2), lifetime=Uniform(0.1, 0.4),
     bursts=((0.3, 2),),
+    max_births=4,
 )  # fmt: skip
 SCENE = Scene(
     (Gravity([0.0, -9.81]), LinearDrag(0.3, air=[1.0, 0.0])), (JET, Lifetime(), OverLife("opacity", [1.0, 0.0]))

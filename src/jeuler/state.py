@@ -130,7 +130,8 @@ class ParticleState:
             bad = np.flatnonzero(~(mass > 0))
             if bad.size:
                 raise ValueError(
-                    f"state.mass must be greater than 0 kg (inf pins a particle), got {mass[bad[0]]} at particle {bad[0]}"
+                    f"state.mass must be greater than 0 kg (inf pins a particle), got {mass[bad[0]]} "
+                    f"at particle {bad[0]}"
                 )
         self._check_fields(shape[0])
 

@@ -117,5 +117,5 @@ def test_a_whole_solution_is_no_frame_and_a_path_has_a_known_end(tmp_path):
         draw(film().y)
     with pytest.raises(ValueError, match=r"must end in .gif, .mp4 or .html, got 'film.avi'"):
         animate(film(), path=tmp_path / "film.avi")
-    with pytest.raises(ValueError, match="needs a solution whose .y is a ParticleState"):
+    with pytest.raises(ValueError, match=r"needs a solution whose .y is a ParticleState"):
         animate(Solution(jnp.zeros(2), jnp.zeros(2), jnp.int32(-1)))

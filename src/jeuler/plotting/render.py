@@ -294,7 +294,7 @@ class View:
     def points_a_metre(self, ax: Any) -> float:
         """How long a metre across the view is in the picture, in points."""
         if len(self.half) == 2:
-            ends = np.array([self.center, self.center + [1, 0]])
+            ends = np.stack([self.center, self.center + np.array([1, 0])])
         else:
             from mpl_toolkits.mplot3d import proj3d
 
