@@ -85,7 +85,7 @@ def main() -> None:
     print(
         f"{platform.machine()}, {os.cpu_count()} CPUs, jax {jax.__version__}, float32, {STEPS} steps, {REPEATS} repeats\n"
     )
-    print("| pool | particles used | alive at the end | missed | us a step, median | of a pool of 5,000 in use |")
+    print("| pool | particles used | alive at the end | missed | us a step | of 5,000 in use |")
     print("|---|---|---|---|---|---|")
     base = statistics.median(seconds["5,000 alive, 300,000 used"])
     for name, times in seconds.items():

@@ -379,6 +379,6 @@ class Picture:
                     linewidths=0,
                     zorder=3,
                     **({"depthshade": False} if self.dim == 3 else {}),
-                )  # fmt: skip
+                )
             )
         return artists

@@ -1,5 +1,8 @@
 """Scenes of bodies: hair, cloth, jelly. All particles live from beginning to end."""
 
+# mypy: disable-error-code="arg-type"
+# Components take numbers, lists and NumPy arrays, and keep JAX arrays: their annotations say what they keep.
+
 from __future__ import annotations
 
 import jax.numpy as jnp

@@ -1,5 +1,8 @@
 """A crowd: thousands of agents that run for a goal over hills, around rocks, without stepping on each other."""
 
+# mypy: disable-error-code="arg-type"
+# Components take numbers, lists and NumPy arrays, and keep JAX arrays: their annotations say what they keep.
+
 from __future__ import annotations
 
 import jax
