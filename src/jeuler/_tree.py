@@ -73,8 +73,13 @@ class Function:
 
     function: Callable
 
-    def __call__(self, *args: Any) -> Any:
-        return self.function(*args)
+    def __call__(self, *args: Any, **fields: Any) -> Any:
+        return self.function(*args, **fields)
+
+
+def replace(component: T, **changes: Any) -> T:
+    """The component with some fields changed; ``dataclasses.replace``, as type checkers understand it."""
+    return dataclasses.replace(component, **changes)  # type: ignore[type-var]
 
 
 def replace(component: T, **changes: Any) -> T:

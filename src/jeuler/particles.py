@@ -1,83 +1,23 @@
-"""Particles: their state, the scene of forces and effects that moves them, and the run."""
+"""The scene of forces and effects that moves particles, and the run."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
 from jeuler._components import by_component, split, stack
+from jeuler.declare import completed, declared, name_of
 from jeuler.forces.fields import per_particle
 from jeuler.methods import Step, euler_step
 from jeuler.solve import Checkpoint, Grid, Solution, advance_by, march, no_loss
-
-
-@_tree.component()
-class ParticleState:
-    """What the particles of a system are at one time.
-
-    Args:
-      position: (particle, dim), m.
-      velocity: (particle, dim), m/s.
-      mass: () or (particle,), kg; ``inf`` pins a particle where it is.
-    Raises: nothing; `simulate` checks it.
-    Example:
-      >>> import jax.numpy as jnp, jeuler
-      >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.zeros((3, 2)), mass=[jnp.inf, 1.0, 1.0])
-      >>> state.position.shape, state.mass.tolist()
-      ((3, 2), [inf, 1.0, 1.0])
-
-    Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 2.
-    """
-
-    position: _tree.Parameter
-    velocity: _tree.Parameter
-    mass: _tree.Parameter = 1.0
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if value is not None and not isinstance(value, jax.Array):
-                object.__setattr__(self, field.name, jnp.asarray(value))
-        if isinstance(self.mass, jax.Array) and jnp.issubdtype(self.mass.dtype, jnp.integer):
-            _tree.store_as_float(self, "mass")
-
-    def check(self) -> None:
-        """Shapes, dtypes and masses that a run can use; one ValueError that says which cannot."""
-        for name in ("position", "velocity"):
-            x = getattr(self, name)
-            if not jnp.issubdtype(x.dtype, jnp.floating):
-                raise ValueError(
-                    f"state.{name} must be floating, got {x.dtype}; convert it, jnp.asarray({name}, dtype=float)"
-                )
-        shape = self.position.shape
-        if len(shape) != 2:
-            raise ValueError(
-                f"state.position must have shape (particle, dim), got {shape}; for a batch of systems use jax.vmap"
-            )
-        if self.velocity.shape != shape:
-            raise ValueError(f"state.velocity must have the shape of position, {shape}, got {self.velocity.shape}")
-        if self.velocity.dtype != self.position.dtype:
-            raise ValueError(
-                f"state.velocity must have the dtype of position, {self.position.dtype}, got {self.velocity.dtype}"
-            )
-        if self.mass.shape not in ((), shape[:1]):
-            raise ValueError(f"state.mass must have shape () or {shape[:1]}, one a particle, got {self.mass.shape}")
-        if not _check.is_traced(self.mass):
-            mass = np.asarray(self.mass).ravel()
-            bad = np.flatnonzero(~(mass > 0))
-            if bad.size:
-                raise ValueError(
-                    f"state.mass must be greater than 0 kg (inf pins a particle), "
-                    f"got {mass[bad[0]]} at particle {bad[0]}"
-                )
+from jeuler.state import ParticleState, parked
+from jeuler.window import in_windows
 
 
 @_tree.component()
@@ -90,9 +30,10 @@ class Scene:
 
     Args:
       forces: functions ``(t, position, velocity, mass) -> (particle, dim)`` in N, such as `Springs` and `Gravity`.
-      effects: functions ``(t, dt, state, key) -> state``, applied after each step in this order, such as
-        `PrescribedMotion`. One that needs the state before the step, such as `Collisions`, has a method
-        ``over_step(t, dt, previous, state, key)``, which is called instead.
+      effects: functions ``(t, dt, state, key) -> state``, applied at each step in this order: births and deaths
+        (`Emitter`, `Lifetime`, ...) before the motion, all others, such as `PrescribedMotion`, after it. One that needs
+        the state before the motion, such as `Collisions`, has a method ``over_step(t, dt, previous, state, key)``,
+        which is called instead.
     Raises: ValueError, in `simulate`, where a force or effect does not fit the state.
     Example:
       >>> import jax, jeuler
@@ -121,7 +62,8 @@ class Scene:
         Args:
           t: time, s.
           y: the pair (position, velocity), each (particle, dim), m and m/s.
-          mass: () or (particle,), kg; a particle of mass inf does not move.
+          mass: () or (particle,), kg; a particle of mass inf does not move. Where forces read further fields of
+            the state, what `Scene.attributes` makes of it.
         Returns: the pair (velocity, acceleration), m/s and m/s^2.
         Example:
           >>> import jax.numpy as jnp, jeuler
@@ -131,15 +73,20 @@ class Scene:
           ([[1.0]], [[-9.5]])
         """
         position, velocity = y
-        mass = jnp.asarray(mass, dtype=position.dtype)
+        fields = mass if isinstance(mass, dict) else {"mass": mass}
+        mass, alive = jnp.asarray(fields["mass"], dtype=position.dtype), fields.get("alive")
         velocity = by_component(lambda v: jnp.where(jnp.isinf(mass), 0, v), velocity)
         position, velocity = self.constrain(t, position, velocity)
         x, v = split(position), split(velocity)
         force = [jnp.zeros_like(component) for component in x]
         for part in self.forces:  # each gets arrays of its own, so that derivatives too are summed by component
-            share = split(part(t, stack(x), stack(v), mass))
+            if alive is not None and hasattr(part, "among"):
+                part = part.among(alive)
+            own = {name: fields[name] for name in declared(part, "reads")}
+            share = split(part(t, stack(x), stack(v), mass, **own))
             force = [a + b for a, b in zip(force, share, strict=True)]
-        slope = stack(v), stack([f / mass for f in force])
+        acceleration = [f / mass if alive is None else jnp.where(alive, f / mass, 0) for f in force]
+        slope = stack(v), stack(acceleration)
         for effect in self.effects:
             if hasattr(effect, "constrain_slope"):
                 slope = effect.constrain_slope(t, *slope)
@@ -149,6 +96,24 @@ class Scene:
         """The same scene with the work done that is the same at every step."""
         forces = (part.prepare(particles, dtype) if hasattr(part, "prepare") else part for part in self.forces)
         return _tree.replace(self, forces=tuple(forces))
+
+    def attributes(self, state: ParticleState) -> Any:
+        """What `vector_field` takes beside t and y: the mass, and with it only those fields that some force reads.
+
+        A dead slot has infinite mass there: it feels no force.
+        """
+        names = {name for part in self.forces for name in declared(part, "reads")}
+        mass = state.mass
+        if state.alive is not None:
+            names.add("alive")
+            mass = jnp.where(state.alive, mass, jnp.inf)
+        return {"mass": mass, **{name: getattr(state, name) for name in sorted(names)}} if names else mass
+
+    def for_step(self, dt: Any) -> Scene:
+        """The scene with drags that never overshoot the air in steps of dt; several share the way to go."""
+        drags = sum(hasattr(part, "for_step") for part in self.forces)
+        forces = (part.for_step(drags * dt) if hasattr(part, "for_step") else part for part in self.forces)
+        return _tree.replace(self, forces=tuple(forces)) if drags else self
 
     def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
         """Position and velocity at time t with the prescribed ones put in."""
@@ -188,12 +153,14 @@ def simulate(
     key: Array | None = None,
     checkpoint: Checkpoint = None,
     compensated: bool = False,
+    windows: tuple[int, ...] = (),
 ) -> Solution:
-    """Run a scene: num_steps steps of its equation of motion, its effects after each, in one ``lax.scan``.
+    """Run a scene: num_steps steps of its equation of motion and its effects, in one ``lax.scan``.
 
         (p, v)_{n+1} = effects(step(scene.vector_field, t_n, (p, v)_n, dt, mass))
 
-    With the default `euler_step` the position moves with the OLD velocity.
+    With the default `euler_step` the position moves with the OLD velocity. Births and deaths come before the motion,
+    all other effects after it: births, attributes, deaths, motion, appearance.
 
     Args:
       scene: forces and effects. Differentiable.
@@ -207,6 +174,9 @@ def simulate(
       key: a ``jax.random.key`` for effects that draw random numbers; each gets its own at each step.
       checkpoint: memory of reverse mode, as in `solve`.
       compensated: compensated sums of position and velocity, as in `solve`.
+      windows: sizes in increasing order. Between two saved states the run works on the smallest of these many first
+        slots that holds all that live or can be born, so that a large pool costs what is alive. Under ``vmap`` all
+        sizes run: leave it empty there.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -219,50 +189,63 @@ def simulate(
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
     state.check()
+    state = completed(state, scene.forces, scene.effects)
     scene.check(state)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=_tree.time_dtype(state.position))
+    scene = scene.for_step(grid.dt)
     state = _at_start(scene, state, grid.t0)
     motion = _check.state("state", (state.position, state.velocity))
-    _check.same_form("the sum of forces", motion, jax.eval_shape(scene.vector_field, grid.t0, motion, state.mass))
-    prepared = scene.prepare(*motion[0].shape[:1], motion[0].dtype)
+    form = jax.eval_shape(scene.vector_field, grid.t0, motion, scene.attributes(state))
+    _check.same_form("the sum of forces", motion, form)
+    _check_effects(scene, state, grid, key)
     advance = advance_by(step if hasattr(step, "increment") else _on_arrays(step), compensated=compensated)
+    # a pool's springs change with who is alive, so there is nothing to prepare
+    prepared = scene if state.alive is not None else scene.prepare(len(state.position), motion[0].dtype)
+    early = any(declared(effect, "before_motion", False) for effect in scene.effects)
 
-    def field(t, motion, mass):  # on components, as they are carried from step to step
-        slope = prepared.vector_field(t, tuple(map(stack, motion)), mass)
+    def field(t, motion, attributes):  # on components, as they are carried from step to step
+        slope = prepared.vector_field(t, tuple(map(stack, motion)), attributes)
         return tuple(map(split, slope))
 
-    def next_state(n, t, state_and_lost):
-        (motion, state), lost = state_and_lost
-        previous = joined(state_and_lost[0]) if scene.effects else None
-        motion, lost = advance(field, t, (motion, lost), grid.dt, state.mass)
-        if not scene.effects:
-            return (motion, state), lost
-        state = joined((motion, state))
+    def apply(n, t, previous, state, *, before_motion):
         for index, effect in enumerate(scene.effects):
-            own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, n), index)
-            now = grid.clock(n + 1), grid.dt
-            if hasattr(effect, "over_step"):
-                state = effect.over_step(*now, previous, state, own_key)
-            else:
-                state = effect(*now, state, own_key)
-        return parted(state), lost
+            if declared(effect, "before_motion", False) == before_motion:
+                own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, n), index)
+                if hasattr(effect, "over_step"):
+                    state = effect.over_step(t, grid.dt, previous, state, own_key)
+                else:
+                    state = effect(t, grid.dt, state, own_key)
+        return state
+
+    def next_state(n, t, parts_and_lost):
+        parts, lost = parts_and_lost
+        previous = joined(parts)
+        if early:
+            previous = apply(n, t, previous, previous, before_motion=True)
+        motion, rest = parted(previous) if early else parts
+        motion, lost = advance(field, t, (motion, lost), grid.dt, scene.attributes(previous))
+        if not scene.effects:
+            return (motion, rest), lost
+        state = apply(n, grid.clock(n + 1), previous, joined((motion, rest)), before_motion=False)
+        return parted(state if state.alive is None else parked(state)), lost
 
     def saved(t, parts):
         state = joined(parts)
         return state if save is None else save(t, state)
 
     start = parted(state), no_loss(parted(state)[0], compensated)
-    return march(next_state, start, grid, saved, watch=lambda parts: parts[0])
+    within = in_windows(windows, scene, state, save_every)
+    return march(next_state, start, grid, saved, watch=lambda parts: parts[0], within=within)
 
 
 def _on_arrays(step: Step) -> Step:
     """A step of somebody's own, which may do arithmetic on (particle, dim) arrays, for the motion by components."""
 
-    def by_components(f, t, motion, dt, mass):
-        def on_arrays(t, y, mass):
-            return tuple(map(stack, f(t, tuple(map(split, y)), mass)))
+    def by_components(f, t, motion, dt, attributes):
+        def on_arrays(t, y, attributes):
+            return tuple(map(stack, f(t, tuple(map(split, y)), attributes)))
 
-        return tuple(map(split, step(on_arrays, t, tuple(map(stack, motion)), dt, mass)))
+        return tuple(map(split, step(on_arrays, t, tuple(map(stack, motion)), dt, attributes)))
 
     return functools.wraps(step)(by_components)
 
@@ -279,6 +262,26 @@ def joined(parts: tuple[tuple, ParticleState]) -> ParticleState:
     return _tree.replace(rest, position=stack(position), velocity=stack(velocity))
 
 
+def _check_effects(scene: Scene, state: ParticleState, grid: Grid, key: Array | None) -> None:
+    """One ValueError if an effect draws random numbers without a key, or returns a state of another form."""
+    for effect in scene.effects:
+        if key is None and declared(effect, "random", False):
+            raise ValueError(
+                f"simulate needs a key, because {name_of(effect)} draws random numbers; "
+                f"pass key=jax.random.key(0)"
+            )
+        after = jax.eval_shape(effect, grid.t0, grid.dt, state, key)
+        if not isinstance(after, ParticleState):
+            raise ValueError(f"{name_of(effect)} must return the state, a ParticleState, got {type(after).__name__}")
+        added = set(after.fields()) ^ set(state.fields())
+        if added:
+            raise ValueError(
+                f"{name_of(effect)} must return the fields that it got, but {', '.join(sorted(added))} came or went; "
+                f'declare what it writes, @jeuler.uses(writes=("{min(added)}",))'
+            )
+        _check.same_form(name_of(effect), state, after)
+
+
 def _at_start(scene: Scene, state: ParticleState, t0: Array) -> ParticleState:
     """The state as the run begins with it: pinned particles at rest, prescribed ones on their path."""
     dtype = state.position.dtype
@@ -286,4 +289,8 @@ def _at_start(scene: Scene, state: ParticleState, t0: Array) -> ParticleState:
     position = jax.lax.convert_element_type(state.position, dtype)
     velocity = jnp.where(per_particle(jnp.isinf(mass)), 0, jax.lax.convert_element_type(state.velocity, dtype))
     position, velocity = scene.constrain(t0, position, velocity)
-    return _tree.replace(state, position=position, velocity=velocity, mass=mass)
+    state = _tree.replace(state, position=position, velocity=velocity, mass=mass)
+    for effect in scene.effects:
+        if hasattr(effect, "at_start"):
+            state = effect.at_start(t0, state)
+    return state if state.alive is None else parked(state)

@@ -128,8 +128,12 @@ def march(
     grid: Grid,
     save: Callable[[Array, PyTree], PyTree] | None,
     watch: Callable[[PyTree], PyTree] = lambda y: y,
+    within: Callable[[Callable[[PyTree], PyTree], PyTree], PyTree] = lambda run, carry: run(carry),
 ) -> Solution:
-    """Carry (y, extra) over the grid by ``next_state(n, t, (y, extra))``, saving y and watching for the non-finite."""
+    """Carry (y, extra) over the grid by ``next_state(n, t, (y, extra))``, saving y and watching for the non-finite.
+
+    ``within(run, carry)`` does what ``run(carry)`` does, the steps between two saved states, on a part of the carry.
+    """
 
     def one_step(carry, _):
         n, first_nonfinite, state = carry
@@ -144,7 +148,7 @@ def march(
         return t, (y if save is None else save(t, y))
 
     def one_save(carry, _):
-        carry, _ = _scan(one_step, carry, grid.save_every, grid.segment)
+        carry = within(lambda carry: _scan(one_step, carry, grid.save_every, grid.segment)[0], carry)
         return carry, saved(carry)
 
     carry = (jnp.int32(0), jnp.int32(-1), start)

@@ -1,8 +1,31 @@
 """Forces: ``force(t, position, velocity, mass) -> (particle, dim)`` in N. One file a family."""
 
+from jeuler.forces.air import Gust, Turbulence, Vortex, Wind, turbulence
+from jeuler.forces.attraction import PointAttractor
 from jeuler.forces.contact import PenaltyContact
-from jeuler.forces.drag import QuadraticDrag
+from jeuler.forces.drag import LinearDrag, QuadraticDrag
 from jeuler.forces.fields import Gravity
+from jeuler.forces.hair import StrandBending, StrandCore, strand_edges
+from jeuler.forces.neighbours import Bending, Viscosity
+from jeuler.forces.soft_body import ShapeMatching
 from jeuler.forces.springs import Springs
 
-__all__ = ["Gravity", "PenaltyContact", "QuadraticDrag", "Springs"]
+__all__ = [
+    "Bending",
+    "Gravity",
+    "Gust",
+    "LinearDrag",
+    "PenaltyContact",
+    "PointAttractor",
+    "QuadraticDrag",
+    "ShapeMatching",
+    "Springs",
+    "StrandBending",
+    "StrandCore",
+    "Turbulence",
+    "Viscosity",
+    "Vortex",
+    "Wind",
+    "strand_edges",
+    "turbulence",
+]

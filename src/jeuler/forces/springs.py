@@ -114,6 +114,11 @@ class Springs:
         r, _ = direction(self.edges.difference(position))
         return jnp.sum(ks * (r - rest_length) ** 2) / 2
 
+    def among(self, alive: Array) -> Springs:
+        """Springs between the living only: a spring with a dead end has no stiffness and no damping."""
+        both = jnp.all(alive[self.edges[:]], axis=1)
+        return _tree.replace(self, ks=jnp.where(both, self.ks, 0), kd=jnp.where(both, self.kd, 0))
+
     @staticmethod
     def _per_spring(x: Array, dtype: Any) -> Array:
         return x.astype(dtype)[:, None] if x.ndim else x.astype(dtype)

@@ -1,0 +1,148 @@
+"""How particles look as they age, and how fast they may go."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler import _check, _tree
+from jeuler.forces.springs import direction
+from jeuler.state import DEFAULTS
+
+
+@_tree.component(static=("field",))
+class OverLife:
+    """A field that follows a curve over each particle's life: colour, opacity, size, shape, or one of your own.
+
+        s = age / lifetime,   field = the line through (times_k, values_k), at s
+
+    Before the first time and after the last one, the value there. ``shape`` takes the nearest lower key instead.
+
+    Args:
+      field: "color", "opacity", "size", "shape" or the name of an extra field. Static.
+      values: (key, ...), what the field is at the keys. Differentiable.
+      times: (key,), the keys' shares of life, increasing, 0 at birth and 1 at death; None spaces them evenly.
+      duration: () s, the same span for all; None takes ``state.lifetime``.
+    Returns: called as an effect ``(t, dt, state, key)``, the state with the field of each particle at its age.
+    Raises: ValueError, if values and times differ in length or times do not increase; in `simulate`, if nothing in the
+      scene provides age (a `Lifetime` does) or lifetime, or another effect writes the field.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> scene = jeuler.Scene(effects=(jeuler.Lifetime(1.0), jeuler.OverLife("opacity", [1.0, 0.0], duration=1.0)))
+      >>> state = jeuler.ParticleState(jnp.ones((1, 2)), jnp.zeros((1, 2)))
+      >>> jeuler.simulate(scene, state, dt=0.25, num_steps=3).y.opacity[:, 0].tolist()
+      [1.0, 0.75, 0.5, 0.25]
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.3.
+    """
+
+    field: str
+    values: Array
+    times: Array | None = None
+    duration: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.field == "shape":
+            object.__setattr__(self, "values", jnp.asarray(self.values, float))
+        _tree.store_as_float(self, "values", "times", "duration")
+        if self.values.ndim < 1 or len(self.values) < 1:
+            raise ValueError(f"OverLife.values must have shape (key, ...), got {self.values.shape}")
+        if self.times is not None and self.times.shape != self.values.shape[:1]:
+            raise ValueError(
+                f"OverLife.times must have one time for each of the {len(self.values)} values, got {self.times.shape}"
+            )
+        if (
+            self.times is not None
+            and not _check.is_traced(self.times)
+            and not (np.diff(np.asarray(self.times)) > 0).all()
+        ):
+            raise ValueError(f"OverLife.times must increase, got {self.times.tolist()}")
+        if self.duration is not None:
+            _check.positive("OverLife.duration", self.duration, "s")
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("age",) if self.duration is not None else ("age", "lifetime")
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        return (self.field,)
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        return {self.field: self.values.shape[1:]}
+
+    def at_start(self, t: Any, state: Any) -> Any:
+        return self(t, 0.0, state, None)
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        field = getattr(state, self.field)
+        life = state.lifetime if self.duration is None else self.duration
+        life = jnp.where(life > 0, life, 1)  # a dead slot has none
+        times = jnp.linspace(0.0, 1.0, len(self.values)) if self.times is None else self.times
+        value = along(state.age / life, times.astype(state.age.dtype), self.values, stepwise=self.field == "shape")
+        return state.replace(**{self.field: value.astype(field.dtype)})
+
+    def check(self, particles: int, dim: int) -> None:
+        if self.field in DEFAULTS and self.values.shape[1:] != DEFAULTS[self.field][0]:
+            raise ValueError(
+                f'OverLife("{self.field}").values must have shape (key, *{DEFAULTS[self.field][0]}), '
+                f"got {self.values.shape}"
+            )
+
+
+def along(s: Array, times: Array, values: Array, *, stepwise: bool) -> Array:
+    """The piecewise linear (or constant) curve through the keys, at each s: (particle,) to (particle, ...).
+
+    A sum of clipped ramps, one a key: no gather, so it costs a few operations a key and particle.
+    """
+    rest = (1,) * (values.ndim - 1)
+    total = jnp.broadcast_to(values[0], (*s.shape, *values.shape[1:]))
+    for k in range(1, len(values)):
+        if stepwise:
+            share = (s >= times[k]).astype(values.dtype)
+        else:
+            share = jnp.clip((s - times[k - 1]) / (times[k] - times[k - 1]), 0, 1)
+        total = total + share.reshape(-1, *rest) * (values[k] - values[k - 1])
+    return total
+
+
+@_tree.component()
+class SpeedLimit:
+    """No particle faster than a limit; the direction is kept.
+
+        v <- v min(1, limit / |v|)
+
+    Args:
+      limit: () or (particle,), m/s, >= 0. Differentiable.
+    Returns: called as an effect ``(t, dt, state, key)``, the state with slower velocities.
+    Raises: ValueError, if a limit is negative; in `simulate`, if it has another shape.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> state = jeuler.ParticleState(jnp.zeros((1, 2)), jnp.array([[3.0, 4.0]]))
+      >>> scene = jeuler.Scene(effects=(jeuler.SpeedLimit(2.5),))
+      >>> jeuler.simulate(scene, state, dt=0.1, num_steps=1).y.velocity[-1].tolist()
+      [[1.5, 2.0]]
+
+    Source: C. W. Reynolds, Steering Behaviors for Autonomous Characters, 1999, "Simple Vehicle Model".
+    """
+
+    limit: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "limit")
+        if not _check.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
+            raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {self.limit.min()}")
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        speed, heading = direction(state.velocity)
+        limit = self.limit[:, None] if self.limit.ndim else self.limit
+        slow = jnp.where(speed > limit, limit * heading, state.velocity)
+        return state.replace(velocity=slow.astype(state.velocity.dtype))
+
+    def check(self, particles: int, dim: int) -> None:
+        if self.limit.shape not in ((), (particles,)):
+            raise ValueError(f"SpeedLimit.limit must have shape () or ({particles},), got {self.limit.shape}")

@@ -1,0 +1,304 @@
+"""Births and deaths. They come before the motion of a step, in the order written."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jeuler import _check, _tree
+from jeuler.effects.samplers import as_sampler, draw
+from jeuler.state import COUNTERS, DEFAULTS
+
+_OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
+
+
+@_tree.component(static=("bursts", "max_births"))
+class Emitter:
+    """Births: a steady stream and bursts, into the first free slots of the pool.
+
+        births in step n = floor((n + 1) rate dt) - floor(n rate dt) + the bursts whose time is nearest to its start
+
+    A newborn is placed where it would be had it been born at a random moment of the step, so that a fast jet shows no
+    layers. A birth that finds no free slot, or goes beyond ``max_births``, is counted in ``state.missed_births``; all
+    that take place are counted in ``state.births``. Gradients flow through every drawn attribute to the parameters of
+    its sampler; the number of births, the slot and the moment carry none, so the derivative by ``rate`` is 0.
+
+    Args:
+      rate: births a second, (), 1/s, >= 0.
+      position: where, a sampler ``(key, count) -> (count, dim)`` such as `FromSphere`, or one point (dim,), m.
+      velocity: how fast, a sampler such as `Cone` or `Normal`, or one vector (dim,), m/s.
+      lifetime, mass, color, opacity, size, shape: what newborns get, a sampler or one value; None leaves the field
+        out of the state, or at its default where another part of the scene has it.
+      extra: samplers of further fields, by name.
+      bursts: pairs (time in s, number of births). Static.
+      start, stop: the stream runs from start to stop, s.
+      max_births: the most births in one step, an integer; fewer draws cost less. None allows the whole pool. Static.
+    Returns: called as an effect ``(t, dt, state, key)``, the state with the births of the step from t to t + dt.
+    Raises: ValueError, if rate is negative, a burst is not a pair (time, number) or max_births is below 1; in
+      `simulate`, if it got no key, or a sampler's shape does not fit.
+    Example:
+      >>> import jax, jeuler
+      >>> jet = jeuler.Emitter(100.0, position=[0.0, 0.0], velocity=jeuler.Cone([0.0, 1.0], speed=5.0, angle=0.3))
+      >>> scene = jeuler.Scene(forces=(jeuler.Gravity([0.0, -9.81]),), effects=(jet,))
+      >>> end = jeuler.simulate(scene, jeuler.empty_pool(60, dim=2), dt=0.01, num_steps=100, key=jax.random.key(0))
+      >>> int(end.y.births[-1]), int(end.y.missed_births[-1])
+      (60, 40)
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.1-2.2.
+    """
+
+    rate: Array
+    position: Any
+    velocity: Any
+    lifetime: Any = None
+    mass: Any = None
+    color: Any = None
+    opacity: Any = None
+    size: Any = None
+    shape: Any = None
+    extra: dict[str, Any] | None = None
+    bursts: tuple[tuple[float, int], ...] = ()
+    start: Array = 0.0  # type: ignore[assignment]
+    stop: Array = jnp.inf  # type: ignore[assignment]
+    max_births: int | None = None
+
+    before_motion = True
+    random = True
+
+    def __post_init__(self) -> None:
+        _check.number("Emitter.rate", self.rate)
+        if not _check.is_traced(self.rate) and float(self.rate) < 0:
+            raise ValueError(f"Emitter.rate must be at least 0 births a second, got {self.rate!r}")
+        if self.max_births is not None:
+            _check.count("Emitter.max_births", self.max_births, least=1)
+        try:
+            bursts = tuple((float(time), _check.count("number", number)) for time, number in self.bursts)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"Emitter.bursts must be pairs (time in s, number of births >= 0), got {self.bursts!r}"
+            ) from None
+        object.__setattr__(self, "bursts", bursts)
+        _tree.store_as_float(self, "rate", "start", "stop")
+        for name in ("position", "velocity", *_OPTIONAL):
+            object.__setattr__(self, name, as_sampler(getattr(self, name)))
+        if self.extra is not None:
+            object.__setattr__(self, "extra", {name: as_sampler(x) for name, x in self.extra.items()})
+
+    @property
+    def samplers(self) -> dict[str, Any]:
+        """What newborns are given, by the name of the field."""
+        named = {name: getattr(self, name) for name in _OPTIONAL if getattr(self, name) is not None}
+        return {**named, **(self.extra or {})}
+
+    @property
+    def writes(self) -> tuple[str, ...]:
+        return ("alive", *COUNTERS, *self.samplers)
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of one particle's value in each further field."""
+
+        def one(sampler):
+            return jax.eval_shape(lambda key: draw(sampler, key, 1), jax.random.key(0)).shape[1:]
+
+        return {name: one(sampler) for name, sampler in (self.extra or {}).items()}
+
+    def number_of_births(self, t: Any, dt: Any) -> Array:
+        """Births in the step that starts at t. The integer step number comes from the clock, so no birth is lost."""
+        n = step_number(t, dt)
+        per_step = lax.stop_gradient(self.rate) * dt
+        streaming = (t + dt / 2 >= self.start) & (t + dt / 2 < self.stop)
+        stream = jnp.where(streaming, jnp.floor((n + 1) * per_step) - jnp.floor(n * per_step), 0)
+        burst = sum(jnp.where(step_number(time, dt) == n, number, 0) for time, number in self.bursts)
+        return (stream + burst).astype(jnp.int32)
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Array) -> Any:
+        capacity, dtype = len(state.position), state.position.dtype
+        block = min(self.max_births or capacity, capacity)
+        free = jnp.cumsum(~state.alive, dtype=jnp.int32)
+        wanted = self.number_of_births(t, dt)
+        births = jnp.minimum(wanted, jnp.minimum(free[-1], block))
+        rank = jnp.arange(block, dtype=jnp.int32)
+        slot = jnp.where(rank < births, jnp.searchsorted(free, rank + 1), capacity)
+
+        def put(name: str, x: Array, newborn: Array) -> Array:
+            if newborn.shape != (block, *x.shape[1:]):
+                raise ValueError(
+                    f"Emitter.{name} must give each newborn a value of shape {x.shape[1:]}, got {newborn.shape[1:]}"
+                )
+            return x.at[slot].set(newborn.astype(x.dtype), mode="drop")
+
+        def sample(name: str, sampler: Any) -> Array:
+            return draw(sampler, jax.random.fold_in(key, zlib.crc32(name.encode())), block)
+
+        since_step = dt * jax.random.uniform(jax.random.fold_in(key, 0), (block,), dtype)
+        velocity = sample("velocity", self.velocity)
+        position = sample("position", self.position) - since_step[:, None] * velocity
+        values = {name: sample(name, sampler) for name, sampler in self.samplers.items()}
+        for name in state.fields():
+            if name in DEFAULTS and name not in values:
+                shape, value = DEFAULTS[name]
+                values[name] = jnp.full((block, *shape), value)
+        if state.age is not None:
+            values["age"] = -since_step
+        values |= {"position": position, "velocity": velocity}
+        new = {name: put(name, getattr(state, name), value) for name, value in values.items()}
+        return state.replace(**new, births=state.births + births, missed_births=state.missed_births + wanted - births)
+
+    def check(self, particles: int, dim: int) -> None:
+        count = min(self.max_births or particles, particles)
+        for name in ("position", "velocity"):
+            shape = jax.eval_shape(
+                lambda key, name=name: draw(getattr(self, name), key, count), jax.random.key(0)
+            ).shape
+            if shape != (count, dim):
+                raise ValueError(
+                    f"Emitter.{name} must give each newborn ({dim},) numbers, one a dimension, got {shape[1:]}"
+                )
+
+
+def step_number(t: Any, dt: Any) -> Array:
+    """t / dt to an integer that grows by exactly one a step: rounding puts the edge away from the usual fractions."""
+    return jnp.floor(lax.stop_gradient(t / dt) + 0.618)
+
+
+@_tree.component()
+class Lifetime:
+    """Ageing, and death by age.
+
+        a particle with age >= lifetime dies; then age <- age + dt
+
+    Args:
+      duration: the same lifetime for all, (), s, > 0; None takes ``state.lifetime``, which an `Emitter` draws.
+    Returns: called as an effect ``(t, dt, state, key)``, the state with deaths and ages.
+    Raises: ValueError, if the duration is not above 0.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> scene = jeuler.Scene(effects=(jeuler.Lifetime(0.2),))
+      >>> state = jeuler.ParticleState(jnp.ones((1, 2)), jnp.zeros((1, 2)))
+      >>> jeuler.simulate(scene, state, dt=0.1, num_steps=3).y.alive[:, 0].tolist()
+      [True, True, True, False]
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.4.
+    """
+
+    duration: Array | None = None
+
+    before_motion = True
+    sets = ("age",)
+    writes = ("alive",)
+
+    def __post_init__(self) -> None:
+        if self.duration is not None:
+            _check.positive("Lifetime.duration", self.duration, "s")
+        _tree.store_as_float(self, "duration")
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return () if self.duration is not None else ("lifetime",)
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        limit = state.lifetime if self.duration is None else self.duration
+        small = 1e-3 * dt  # ages are sums of dt: a lifetime of three steps ends after three, not four
+        return state.replace(
+            alive=state.alive & (state.age < limit - small), age=state.age + dt.astype(state.age.dtype)
+        )
+
+
+@_tree.component(static=("condition",))
+class Death:
+    """Death where a condition holds.
+
+    Args:
+      condition: a function ``condition(t, state) -> (particle,)`` boolean. Static.
+    Returns: called as an effect ``(t, dt, state, key)``, the state without the particles for which it holds.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> too_hot = jeuler.Death(lambda t, state: state.temperature > 100.0)
+      >>> state = jeuler.ParticleState(jnp.zeros((2, 1)), jnp.zeros((2, 1)), extra={"temperature": [20.0, 120.0]})
+      >>> jeuler.simulate(jeuler.Scene(effects=(too_hot,)), state, dt=0.1, num_steps=1).y.alive[-1].tolist()
+      [True, False]
+    """
+
+    condition: Callable[[Any, Any], Array]
+
+    before_motion = True
+    writes = ("alive",)
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        return state.replace(alive=state.alive & ~self.condition(t, state))
+
+
+@_tree.component()
+class DeathOutside:
+    """Death by leaving a box. A particle whose position is not a number is outside.
+
+    Args:
+      low: (dim,) or (), m; -inf leaves a side open.
+      high: (dim,) or (), m.
+    Returns: called as an effect ``(t, dt, state, key)``, the state without the particles outside.
+    Raises: ValueError, in `simulate`, if a bound has another shape.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> scene = jeuler.Scene(effects=(jeuler.DeathOutside(low=[-1.0, -1.0], high=[1.0, 1.0]),))
+      >>> state = jeuler.ParticleState(jnp.array([[0.0, 0.0], [0.0, 2.0]]), jnp.zeros((2, 2)))
+      >>> jeuler.simulate(scene, state, dt=0.1, num_steps=1).y.alive[-1].tolist()
+      [True, False]
+    """
+
+    low: Array
+    high: Array
+
+    before_motion = True
+    writes = ("alive",)
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "low", "high")
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        inside = jnp.all((state.position >= self.low) & (state.position <= self.high), axis=1)
+        return state.replace(alive=state.alive & inside)
+
+    def check(self, particles: int, dim: int) -> None:
+        for name in ("low", "high"):
+            if getattr(self, name).shape not in ((), (dim,)):
+                raise ValueError(f"DeathOutside.{name} must have shape () or ({dim},), got {getattr(self, name).shape}")
+
+
+@_tree.component()
+class DeathOnContact:
+    """Death by touching a surface.
+
+        a particle dies where distance(t, p) <= margin
+
+    Args:
+      collider: the signed distance ``collider(t, point) -> ()`` of one point (dim,), m, negative inside; what
+        `Collisions` takes too.
+      margin: (), m, how near is contact.
+    Returns: called as an effect ``(t, dt, state, key)``, the state without the particles in contact.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> ground = jeuler.DeathOnContact(lambda t, p: p[1])
+      >>> state = jeuler.ParticleState(jnp.array([[0.0, -1.0], [0.0, 2.0]]), jnp.zeros((2, 2)))
+      >>> jeuler.simulate(jeuler.Scene(effects=(ground,)), state, dt=0.1, num_steps=1).y.alive[-1].tolist()
+      [False, True]
+    """
+
+    collider: Any
+    margin: Array = 0.0  # type: ignore[assignment]
+
+    before_motion = True
+    writes = ("alive",)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "collider", _tree.as_component(self.collider))
+        _tree.store_as_float(self, "margin")
+
+    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+        distance = jax.vmap(self.collider, (None, 0))(t, state.position)
+        return state.replace(alive=state.alive & (distance > self.margin))

@@ -1,0 +1,306 @@
+"""Samplers: ``sampler(key, count) -> (count, ...)``, what an `Emitter` draws the attributes of newborns from.
+
+Each is a smooth function of its parameters and of noise that does not depend on them (reparameterised sampling), so
+gradients reach the parameters.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler import _tree
+from jeuler.forces.springs import direction
+
+
+def draw(sampler: Any, key: Array, count: int) -> Array:
+    """``count`` values of a sampler, or of a plain number or array, which every particle gets."""
+    if callable(sampler):
+        return sampler(key, count)
+    value = jnp.asarray(sampler)
+    return jnp.broadcast_to(value, (count, *value.shape))
+
+
+def as_sampler(x: Any) -> Any:
+    """A sampler as a pytree of floating arrays; numbers and arrays become arrays, None stays."""
+    return _tree.as_component(x) if callable(x) else _tree.as_float(x)
+
+
+@_tree.component()
+class Uniform:
+    """Uniform between two bounds, each component by itself.
+
+        x = low + (high - low) u,   u uniform in [0, 1)
+
+    Args:
+      low: () or (component,). Differentiable.
+      high: () or (component,). Differentiable.
+    Returns: called as ``sampler(key, count)``, (count,) or (count, component).
+    Example:
+      >>> import jax, jeuler
+      >>> x = jeuler.Uniform(1.0, 2.0)(jax.random.key(0), 100)
+      >>> x.shape, bool((x >= 1).all() and (x < 2).all())
+      ((100,), True)
+    """
+
+    low: Array
+    high: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "low", "high")
+
+    def __call__(self, key: Array, count: int) -> Array:
+        shape, dtype = jnp.broadcast_shapes(self.low.shape, self.high.shape), jnp.result_type(self.low, self.high)
+        return self.low + (self.high - self.low) * jax.random.uniform(key, (count, *shape), dtype)
+
+
+@_tree.component()
+class Normal:
+    """Normal (Gaussian), each component by itself.
+
+        x = mean + deviation n,   n standard normal
+
+    Args:
+      mean: () or (component,). Differentiable.
+      deviation: standard deviation, () or (component,). Differentiable.
+    Returns: called as ``sampler(key, count)``, (count,) or (count, component).
+    Example:
+      >>> import jax, jeuler
+      >>> jeuler.Normal([0.0, 1.0], 0.1)(jax.random.key(0), 5).shape
+      (5, 2)
+    """
+
+    mean: Array
+    deviation: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "mean", "deviation")
+
+    def __call__(self, key: Array, count: int) -> Array:
+        shape = jnp.broadcast_shapes(self.mean.shape, self.deviation.shape)
+        dtype = jnp.result_type(self.mean, self.deviation)
+        return self.mean + self.deviation * jax.random.normal(key, (count, *shape), dtype)
+
+
+@_tree.component()
+class Choice:
+    """One of the rows of a table, each as likely: a palette of colours, a set of sizes.
+
+    Args:
+      values: (choice, ...). Differentiable; which row is drawn is not.
+    Returns: called as ``sampler(key, count)``, (count, ...).
+    Example:
+      >>> import jax, jeuler
+      >>> sorted(set(jeuler.Choice([1.0, 5.0])(jax.random.key(0), 50).tolist()))
+      [1.0, 5.0]
+    """
+
+    values: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "values")
+
+    def __call__(self, key: Array, count: int) -> Array:
+        return self.values[jax.random.randint(key, (count,), 0, len(self.values))]
+
+
+@_tree.component()
+class FromLine:
+    """Uniform on a line segment.
+
+        x = start + (end - start) u
+
+    Args:
+      start: (dim,), m. Differentiable.
+      end: (dim,), m. Differentiable.
+    Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Example:
+      >>> import jax, jeuler
+      >>> x = jeuler.FromLine([0.0, 1.0], [2.0, 1.0])(jax.random.key(0), 3)
+      >>> x.shape, x[:, 1].tolist()
+      ((3, 2), [1.0, 1.0, 1.0])
+    """
+
+    start: Array
+    end: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "start", "end")
+
+    def __call__(self, key: Array, count: int) -> Array:
+        return self.start + (self.end - self.start) * jax.random.uniform(key, (count, 1), self.start.dtype)
+
+
+@_tree.component()
+class FromDisc:
+    """Uniform on a disc: in the plane, or in space across a normal.
+
+        x = center + radius sqrt(u) (cos a, sin a)
+
+    Args:
+      center: (dim,), m, dim 2 or 3. Differentiable.
+      radius: (), m. Differentiable.
+      normal: (3,), the axis of a disc in space; ignored in the plane.
+    Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Example:
+      >>> import jax, jeuler
+      >>> x = jeuler.FromDisc([0.0, 0.0, 5.0], 1.0)(jax.random.key(0), 4)
+      >>> x.shape, x[:, 2].tolist()
+      ((4, 3), [5.0, 5.0, 5.0, 5.0])
+    """
+
+    center: Array
+    radius: Array
+    normal: Array = (0.0, 0.0, 1.0)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "center", "radius", "normal")
+
+    def __call__(self, key: Array, count: int) -> Array:
+        u = jax.random.uniform(key, (2, count), self.center.dtype)
+        r, angle = self.radius * jnp.sqrt(u[0]), 2 * jnp.pi * u[1]
+        x, y = (r * jnp.cos(angle))[:, None], (r * jnp.sin(angle))[:, None]
+        if len(self.center) == 2:
+            return self.center + jnp.concatenate([x, y], axis=1)
+        first, second, _ = frame(self.normal)
+        return self.center + x * first + y * second
+
+
+@_tree.component(static=("surface",))
+class FromSphere:
+    """Uniform in a ball, or on its surface, in any dimension.
+
+        x = center + radius u^(1/dim) n / |n|,   n standard normal
+
+    Args:
+      center: (dim,), m. Differentiable.
+      radius: (), m. Differentiable.
+      surface: True draws from the surface only.
+    Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Example:
+      >>> import jax, jax.numpy as jnp, jeuler
+      >>> x = jeuler.FromSphere([0.0, 0.0, 0.0], 2.0, surface=True)(jax.random.key(0), 4)
+      >>> bool(jnp.allclose(jnp.linalg.norm(x, axis=1), 2.0))
+      True
+
+    Source: M. E. Muller, A note on a method for generating points uniformly on n-dimensional spheres, 1959.
+    """
+
+    center: Array
+    radius: Array
+    surface: bool = False
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "center", "radius")
+
+    def __call__(self, key: Array, count: int) -> Array:
+        for_direction, for_radius = jax.random.split(key)
+        dim, dtype = len(self.center), self.center.dtype
+        _, n = direction(jax.random.normal(for_direction, (count, dim), dtype))
+        share = 1.0 if self.surface else jax.random.uniform(for_radius, (count, 1), dtype) ** (1 / dim)
+        return self.center + self.radius * share * n
+
+
+@_tree.component(static=("faces",))
+class FromSurface:
+    """Uniform on a surface of triangles (in space or in the plane).
+
+        x = a + s (b - a) + q (c - a),   a triangle (a, b, c) drawn by its area
+
+    Args:
+      vertices: (vertex, dim), m. Differentiable; which triangle is drawn is not.
+      faces: the three vertices of each triangle, integers (face, 3). Static.
+    Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: ValueError, if faces is not (face, 3) or names a vertex that is not there.
+    Example:
+      >>> import jax, jeuler
+      >>> jeuler.FromSurface([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])(jax.random.key(0), 7).shape
+      (7, 2)
+
+    Source: R. Osada et al., Shape distributions, ACM Transactions on Graphics 21, 2002, sect. 4.2.
+    """
+
+    vertices: Array
+    faces: tuple[tuple[int, int, int], ...]
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "vertices")
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+            raise ValueError(f"FromSurface.faces must be integers of shape (face, 3), got {faces.dtype} {faces.shape}")
+        if faces.min() < 0 or faces.max() >= len(self.vertices):
+            raise ValueError(
+                f"FromSurface.faces must be indices from 0 to {len(self.vertices) - 1}, "
+                f"got from {faces.min()} to {faces.max()}"
+            )
+        object.__setattr__(self, "faces", tuple(map(tuple, faces.tolist())))
+
+    def __call__(self, key: Array, count: int) -> Array:
+        for_face, for_place = jax.random.split(key)
+        a, b, c = (self.vertices[np.array(self.faces)[:, k]] for k in range(3))
+        ab, ac = b - a, c - a
+        square = jnp.sum(ab**2, -1) * jnp.sum(ac**2, -1) - jnp.sum(ab * ac, -1) ** 2  # 4 area^2
+        face = jax.random.categorical(for_face, jnp.log(jax.lax.stop_gradient(square)) / 2, shape=(count,))
+        u = jax.random.uniform(for_place, (2, count, 1), a.dtype)
+        s, q = jnp.where(u.sum(axis=0) > 1, 1 - u, u)  # the far half of the parallelogram folds back
+        return a[face] + s * ab[face] + q * ac[face]
+
+
+@_tree.component()
+class Cone:
+    """Velocities in a cone: directions uniform in the solid angle about an axis, speeds from a sampler.
+
+        v = speed (cos b axis + sin b side)
+        in space cos b is uniform in [cos angle, 1], in the plane b in [-angle, angle]
+
+    Args:
+      direction: the axis, (dim,), any length, dim 2 or 3. Differentiable.
+      speed: (), m/s, or a sampler of it. Differentiable.
+      angle: half the opening angle, (), rad; pi is every direction. Differentiable.
+    Returns: called as ``sampler(key, count)``, (count, dim), m/s.
+    Example:
+      >>> import jax, jeuler
+      >>> jet = jeuler.Cone([0.0, 0.0, 1.0], speed=jeuler.Uniform(4.0, 6.0), angle=0.2)
+      >>> v = jet(jax.random.key(0), 50)
+      >>> v.shape, bool((v[:, 2] > 3.9).all())
+      ((50, 3), True)
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.2.
+    """
+
+    direction: Array
+    speed: Any
+    angle: Array = 0.0  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "direction", "angle")
+        object.__setattr__(self, "speed", as_sampler(self.speed))
+
+    def __call__(self, key: Array, count: int) -> Array:
+        for_speed, for_angle = jax.random.split(key)
+        dtype = self.direction.dtype
+        speed = draw(self.speed, for_speed, count).reshape(-1, 1)
+        u = jax.random.uniform(for_angle, (2, count, 1), dtype)
+        if len(self.direction) == 2:
+            _, axis = direction(self.direction)
+            side = jnp.stack([-axis[1], axis[0]])
+            turn = self.angle * (2 * u[0] - 1)
+            return speed * (jnp.cos(turn) * axis + jnp.sin(turn) * side)
+        first, second, axis = frame(self.direction)
+        # with w = 2 sin(angle / 2)^2 = 1 - cos(angle): 1 - cos b = u w, smooth also at angle = 0
+        down = u[0] * 2 * jnp.sin(self.angle / 2) ** 2
+        sine = jnp.sqrt(u[0]) * 2 * jnp.sin(self.angle / 2) * jnp.sqrt(1 - down / 2)
+        around = 2 * jnp.pi * u[1]
+        return speed * ((1 - down) * axis + sine * (jnp.cos(around) * first + jnp.sin(around) * second))
+
+
+def frame(axis: Array) -> tuple[Array, Array, Array]:
+    """Two unit vectors across a direction in space, and the direction itself: a right-handed frame."""
+    _, third = direction(axis)
+    seed = jnp.where(jnp.abs(third[2]) < 0.9, jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0]))
+    _, first = direction(jnp.cross(seed.astype(third.dtype), third))
+    return first, jnp.cross(third, first), third

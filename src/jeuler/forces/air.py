@@ -1,0 +1,224 @@
+"""How the air moves: ``air(t, position) -> (particle, dim)`` in m/s. Drag takes particles along with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler import _tree
+
+
+def as_air(air: Any) -> Any:
+    """Air given as one field, several that add up, a velocity (dim,), or None for air at rest."""
+    if air is None:
+        return ()
+    if isinstance(air, (tuple, list)) and all(callable(part) for part in air):
+        return tuple(_tree.as_component(part) for part in air)
+    return (_tree.as_component(air) if callable(air) else Wind(air),)
+
+
+def air_velocity(air: tuple, t: Any, position: Array) -> Array | float:
+    """The sum of the fields at each particle; 0 where there is none."""
+    return sum((part(t, position) for part in air), start=0.0)
+
+
+def at_time(x: Any, t: Any, dtype: Any = None) -> Array:
+    """A place or strength that may be a function of time."""
+    return jnp.asarray(x(t) if callable(x) else x, dtype)
+
+
+def check_air(name: str, air: tuple, particles: int, dim: int) -> None:
+    """Each field of the air gives a velocity of the right dimension."""
+    t, position = jnp.zeros(()), jnp.zeros((particles, dim))
+    for part in air:
+        try:
+            shape = jax.eval_shape(part, t, position).shape
+        except (TypeError, ValueError) as error:
+            shape = str(error).splitlines()[0]
+        if shape != (particles, dim):
+            raise ValueError(
+                f"{name}.air must give a velocity of shape ({particles}, {dim}), (particle, dim); "
+                f"{type(part).__name__} gives {shape}"
+            )
+
+
+def moving(x: Any) -> Any:
+    """A parameter that may be a function of time, as a pytree of floating arrays."""
+    return _tree.as_component(x) if callable(x) else _tree.as_float(x)
+
+
+@_tree.component()
+class Wind:
+    """A uniform wind, steady or any function of time.
+
+        w(p, t) = velocity(t)
+
+    Args:
+      velocity: (dim,), m/s, or a function ``velocity(t) -> (dim,)``. Differentiable.
+    Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> jeuler.Wind([3.0, 0.0])(0.0, jnp.zeros((2, 2))).tolist()
+      [[3.0, 0.0], [3.0, 0.0]]
+    """
+
+    velocity: Any
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "velocity", moving(self.velocity))
+
+    def __call__(self, t: Any, position: Array) -> Array:
+        return jnp.broadcast_to(at_time(self.velocity, t, position.dtype), position.shape)
+
+
+@_tree.component()
+class Gust:
+    """A gust that comes again and again and fades between.
+
+        w(p, t) = velocity (1 - cos(2 pi t / period)) / 2
+
+    Args:
+      velocity: of the air at the height of the gust, (dim,), m/s. Differentiable.
+      period: from one gust to the next, (), s. Differentiable.
+    Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> jeuler.Gust([4.0, 0.0], period=2.0)(1.0, jnp.zeros((1, 2))).tolist()
+      [[4.0, 0.0]]
+
+    Source: F. M. Hoblit, Gust Loads on Aircraft: Concepts and Applications, 1988 (the one-minus-cosine gust).
+    """
+
+    velocity: Array
+    period: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "velocity", "period")
+
+    def __call__(self, t: Any, position: Array) -> Array:
+        strength = (1 - jnp.cos(2 * jnp.pi * t / self.period)) / 2
+        return jnp.broadcast_to((self.velocity * strength).astype(position.dtype), position.shape)
+
+
+@_tree.component()
+class Turbulence:
+    """A random wind without sources, a sum of waves that drift: eddies of one size.
+
+        w(p, t) = speed sqrt(2 / M) sum_m a_m cos(k_m.p / size + phase_m + f_m t / time),   a_m perpendicular to k_m
+
+    Its divergence is 0 everywhere and its root mean square is ``speed``. `turbulence` draws the waves.
+
+    Args:
+      speed: root mean square, (), m/s. Differentiable.
+      size: of the eddies, (), m. Differentiable.
+      time: in which an eddy changes, (), s; inf freezes the field. Differentiable.
+      waves: k, (wave, dim), of length near 1.
+      amplitudes: a, (wave, dim), unit vectors across the waves.
+      phases: (wave,), rad.
+      frequencies: f, (wave,), rad.
+    Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> jeuler.turbulence(dim=3, speed=1.0, size=0.5, seed=1)(0.0, jnp.zeros((4, 3))).shape
+      (4, 3)
+
+    Source: R. H. Kraichnan, Diffusion by a random velocity field, Physics of Fluids 13, 1970.
+    """
+
+    speed: Array
+    size: Array
+    time: Array
+    waves: Array
+    amplitudes: Array
+    phases: Array
+    frequencies: Array
+
+    def __post_init__(self) -> None:
+        _tree.store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
+
+    def __call__(self, t: Any, position: Array) -> Array:
+        dtype = position.dtype
+        waves, amplitudes = (self.waves / self.size).astype(dtype), self.amplitudes.astype(dtype)
+        angle = position @ waves.T + (self.phases + self.frequencies * t / self.time).astype(dtype)
+        return (self.speed * jnp.sqrt(2 / len(waves))).astype(dtype) * (jnp.cos(angle) @ amplitudes)
+
+
+def turbulence(
+    *, dim: int, speed: Any, size: Any, time: Any = float("inf"), modes: int = 12, seed: int = 0
+) -> Turbulence:
+    """A `Turbulence` with waves drawn from a seed.
+
+    Args:
+      dim: 2 or 3.
+      speed: root mean square, (), m/s.
+      size: of the eddies, (), m.
+      time: in which an eddy changes, (), s; inf freezes the field.
+      modes: the number of waves; the cost grows with it.
+      seed: an integer; the same seed gives the same field.
+    Returns: the `Turbulence`.
+    Raises: ValueError, if dim is not 2 or 3.
+    Example:
+      >>> import jeuler
+      >>> jeuler.turbulence(dim=2, speed=1.0, size=0.5, modes=8).waves.shape
+      (8, 2)
+    """
+    if dim not in (2, 3):
+        raise ValueError(f"turbulence.dim must be 2 or 3, got {dim!r}")
+    random = np.random.default_rng(seed)
+    waves = random.normal(size=(modes, dim))
+    waves *= (random.uniform(0.7, 1.3, size=modes) / np.linalg.norm(waves, axis=1))[:, None]
+    if dim == 2:
+        across = np.stack([-waves[:, 1], waves[:, 0]], axis=1)
+    else:
+        across = np.cross(waves, random.normal(size=(modes, dim)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    phases, frequencies = random.uniform(0, 2 * np.pi, modes), random.normal(size=modes)
+    return Turbulence(speed, size, time, *map(jnp.asarray, (waves, across, phases, frequencies)))
+
+
+@_tree.component()
+class Vortex:
+    """Air that turns about an axis, with a core that turns like a solid body.
+
+        w = circulation / (2 pi r) (1 - exp(-r^2 / core^2)),   across the axis, r the distance to it
+
+    Args:
+      center: a point of the axis, (dim,), m, or a function of time. dim is 2 or 3. Differentiable.
+      circulation: (), m^2/s; positive turns counterclockwise about the axis. Differentiable.
+      core: radius of the core, (), m, > 0. Differentiable.
+      axis: (3,), direction of the axis in space, any length; ignored in the plane. Differentiable.
+    Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> w = jeuler.Vortex([0.0, 0.0], circulation=2 * jnp.pi, core=0.1)(0.0, jnp.array([[1.0, 0.0], [0.0, 0.0]]))
+      >>> (abs(w) + 0.0).round(4).tolist()
+      [[0.0, 1.0], [0.0, 0.0]]
+
+    Source: H. Lamb, Hydrodynamics, 6th ed., 1932, sect. 334a (the Lamb-Oseen vortex).
+    """
+
+    center: Any
+    circulation: Array
+    core: Array
+    axis: Array = (0.0, 0.0, 1.0)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", moving(self.center))
+        _tree.store_as_float(self, "circulation", "core", "axis")
+
+    def __call__(self, t: Any, position: Array) -> Array:
+        dtype = position.dtype
+        offset = position - at_time(self.center, t, dtype)
+        if position.shape[1] == 2:
+            across = jnp.stack([-offset[:, 1], offset[:, 0]], axis=1)
+        else:
+            axis = (self.axis / jnp.linalg.norm(self.axis)).astype(dtype)
+            across = jnp.cross(axis, offset)
+        square = jnp.sum(across**2, axis=1, keepdims=True) / self.core.astype(dtype) ** 2
+        outside = square > 1e-6  # within, (1 - exp(-s)) / s is 1 to single precision's last digits
+        shape = jnp.where(outside, -jnp.expm1(-square) / jnp.where(outside, square, 1), 1 - square / 2)
+        return (self.circulation / (2 * jnp.pi * self.core**2)).astype(dtype) * shape * across

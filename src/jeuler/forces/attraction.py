@@ -1,0 +1,60 @@
+"""Points that pull or push."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jeuler import _tree
+from jeuler.forces.air import at_time, moving
+from jeuler.forces.fields import per_particle
+
+
+@_tree.component(static=("power",))
+class PointAttractor:
+    """A point that pulls every particle; with negative strength it pushes.
+
+        F_i = m_i strength d / (|d|^2 + softening^2)^((power + 1) / 2),   d = center - p_i
+
+    Far away the acceleration is strength / |d|^power. At the point itself the force is 0.
+
+    Args:
+      center: (dim,), m, or a function of time ``center(t) -> (dim,)``, such as a `SampledPath`. Differentiable.
+      strength: (), m^(power+1)/s^2, or a function of time. Differentiable.
+      softening: (), m, > 0: the distance below which the pull no longer grows. Differentiable.
+      power: 2 for gravity, 1 for a line charge, 0 for the same pull at any distance. Static.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+      A pinned particle feels none.
+    Raises: ValueError, in `simulate`, if the center has another dim.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> sun = jeuler.PointAttractor([0.0, 0.0], strength=4.0, softening=1e-6)
+      >>> sun(0.0, jnp.array([[2.0, 0.0]]), jnp.zeros((1, 2)), jnp.asarray(3.0)).round().tolist()
+      [[-3.0, 0.0]]
+
+    Source: H. C. Plummer, On the problem of distribution in globular star clusters, 1911 (the softening).
+    """
+
+    center: Any
+    strength: Any
+    softening: Array
+    power: float = 2
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", moving(self.center))
+        object.__setattr__(self, "strength", moving(self.strength))
+        _tree.store_as_float(self, "softening")
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        d = at_time(self.center, t, position.dtype) - position
+        square = jnp.sum(d * d, axis=1, keepdims=True) + self.softening.astype(position.dtype) ** 2
+        acceleration = at_time(self.strength, t, position.dtype) * d * square ** (-(self.power + 1) / 2)
+        return per_particle(jnp.where(jnp.isfinite(mass), mass, 0)) * acceleration
+
+    def check(self, particles: int, dim: int) -> None:
+        shape = jax.eval_shape(at_time, self.center, jnp.zeros(())).shape
+        if shape != (dim,):
+            raise ValueError(f"PointAttractor.center must have shape ({dim},), got {shape}")

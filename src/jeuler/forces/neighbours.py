@@ -1,0 +1,186 @@
+"""Forces between the neighbours of a fixed topology: viscosity and bending."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler import _tree
+from jeuler.forces.springs import direction
+from jeuler.forces.topology import Topology
+
+
+@_tree.component(static=("edges",))
+class Viscosity:
+    """Friction between neighbours: each particle is dragged along by those that it is joined to.
+
+        F_i = c (v_j - v_i),   F_j = -F_i
+
+    Unlike a spring's damper it acts in every direction, not only along the edge.
+
+    Args:
+      edges: the two particles of each pair, integers (pair, 2). Static.
+      coefficient: c, shape () or (pair,), N s/m. Differentiable.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+    Raises: ValueError, if edges is not an integer (pair, 2) array; in `simulate`, if an index is out of range.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> v = jnp.array([[1.0, 0.0], [0.0, 0.0]])
+      >>> jeuler.Viscosity([[0, 1]], 0.5)(0.0, jnp.zeros((2, 2)), v, jnp.asarray(1.0)).tolist()
+      [[-0.5, 0.0], [0.5, 0.0]]
+
+    Source: D. Terzopoulos, J. Platt, K. Fleischer, Heating and melting deformable models, 1991.
+    """
+
+    edges: Topology
+    coefficient: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "edges", Topology(self.edges))
+        _tree.store_as_float(self, "coefficient")
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        c = self.coefficient.astype(position.dtype)
+        c = c[:, None] if c.ndim else c
+        return self.edges.accumulate(-c * self.edges.difference(velocity), len(position))
+
+    def among(self, alive: Array) -> Viscosity:
+        """Only between the living."""
+        return _tree.replace(self, coefficient=only_among(alive, self.edges, self.coefficient))
+
+    def check(self, particles: int, dim: int) -> None:
+        self.edges.check(particles)
+        if self.coefficient.shape not in ((), (len(self.edges),)):
+            raise ValueError(
+                f"Viscosity.coefficient must have shape () or ({len(self.edges)},), one a pair, "
+                f"got {self.coefficient.shape}"
+            )
+
+
+def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
+    """The coefficient of each group of particles, 0 where one of them is dead: (group,)."""
+    return jnp.where(jnp.all(alive[np.asarray(groups)], axis=1), coefficient, 0)
+
+
+@_tree.component(static=("triples",))
+class Bending:
+    """Resistance of a rope, a hair or a cloth to bending, about each middle particle.
+
+        e = p_j - p_i,  f = p_k - p_j,  theta = the angle between e and f
+        E = stiffness (theta - rest_angle)^2 / 2,   F = -dE/dp
+
+    Straight has angle 0. Where the angle is exactly 0 or pi the direction of bending is not determined: the part of
+    the force that needs it is 0 there.
+
+    Args:
+      triples: (i, j, k), j in the middle, integers (triple, 3). Static.
+      stiffness: () or (triple,), N m/rad^2. Differentiable.
+      rest_angle: () or (triple,), rad. Differentiable.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+      It sums to zero and has no torque.
+    Raises: ValueError, if triples is not an integer (triple, 3) array; in `simulate`, if an index is out of range.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> corner = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+      >>> jeuler.Bending([[0, 1, 2]], 2 / jnp.pi)(0.0, corner, 0 * corner, jnp.asarray(1.0)).round(4).tolist()
+      [[0.0, -1.0], [-1.0, 1.0], [1.0, 0.0]]
+
+    Source: M. Bergou et al., Discrete Elastic Rods, ACM Transactions on Graphics 27, 2008, sect. 4.2 (turning angle).
+    """
+
+    triples: Any
+    stiffness: Array
+    rest_angle: Array = 0.0  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        triples = np.asarray(self.triples)
+        if triples.ndim != 2 or triples.shape[1] != 3 or not np.issubdtype(triples.dtype, np.integer):
+            raise ValueError(
+                f"Bending.triples must be integers of shape (triple, 3), got {triples.dtype} {triples.shape}"
+            )
+        object.__setattr__(self, "triples", Indices(triples))
+        _tree.store_as_float(self, "stiffness", "rest_angle")
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        i, j, k = np.asarray(self.triples).T
+        stiffness, rest = (x.astype(position.dtype) for x in (self.stiffness, self.rest_angle))
+        e, f = position[j] - position[i], position[k] - position[j]
+        e_length, e_unit = direction(e)
+        f_length, f_unit = direction(f)
+        cosine = jnp.sum(e_unit * f_unit, axis=1)
+        _, theta_over_sine, one_over_sine = angle_from(e_unit, f_unit, cosine)
+        # dE/dp = -stiffness (theta - rest) / sin(theta) d(cos theta)/dp
+        pull = (stiffness * (theta_over_sine - rest * one_over_sine))[:, None]
+        on_i = -pull * (f_unit - cosine[:, None] * e_unit) * reciprocal(e_length)
+        on_k = pull * (e_unit - cosine[:, None] * f_unit) * reciprocal(f_length)
+        total = jnp.zeros_like(position)
+        return total.at[i].add(on_i).at[j].add(-on_i - on_k).at[k].add(on_k)
+
+    def energy(self, t: Any, position: Array, mass: Array) -> Array:
+        """Potential energy, J."""
+        i, j, k = np.asarray(self.triples).T
+        _, e = direction(position[j] - position[i])
+        _, f = direction(position[k] - position[j])
+        theta, _, _ = angle_from(e, f, jnp.sum(e * f, axis=1))
+        return jnp.sum(self.stiffness * (theta - self.rest_angle) ** 2) / 2
+
+    def among(self, alive: Array) -> Bending:
+        """Only between the living."""
+        return _tree.replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
+
+    def check(self, particles: int, dim: int) -> None:
+        check_indices("Bending.triples", self.triples, particles)
+        for name in ("stiffness", "rest_angle"):
+            shape = getattr(self, name).shape
+            if shape not in ((), (len(self.triples),)):
+                raise ValueError(
+                    f"Bending.{name} must have shape () or ({len(self.triples)},), one a triple, got {shape}"
+                )
+
+
+def reciprocal(length: Array) -> Array:
+    """1 / length, and 0 where the length is 0."""
+    return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 0)
+
+
+def angle_from(e: Array, f: Array, cosine: Array) -> tuple[Array, Array, Array]:
+    """theta between unit vectors, theta / sin(theta) (1 at 0), and 1 / sin(theta) (0 at 0 and pi)."""
+    half_sine = jnp.sum((f - e) ** 2, axis=1) / 4  # sin^2(theta / 2), exact for small angles
+    square = 4 * half_sine * (1 - half_sine)  # sin^2(theta)
+    bent = square > 1e-10 if e.dtype == jnp.float64 else square > 1e-6
+    sine = jnp.sqrt(jnp.where(bent, square, 1))
+    theta = jnp.where(bent, jnp.atan2(sine, cosine), jnp.where(cosine > 0, 0, jnp.pi))
+    ratio = jnp.where(bent, theta / sine, jnp.where(cosine > 0, 1 + square / 6, 0))
+    return theta, ratio, jnp.where(bent, 1 / sine, 0)
+
+
+class Indices:
+    """Fixed particle indices, as part of the program: hashable and equal by content."""
+
+    def __init__(self, indices: Any) -> None:
+        self.indices = np.array(indices, np.int32)
+        self.indices.setflags(write=False)
+        self._key = (self.indices.shape, self.indices.tobytes())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Indices) and self._key == other._key
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.indices, dtype=dtype)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+def check_indices(name: str, indices: Any, particles: int) -> None:
+    indices = np.asarray(indices)
+    if indices.size and not 0 <= indices.min() <= indices.max() < particles:
+        raise ValueError(
+            f"{name} must be particle indices from 0 to {particles - 1}, got from {indices.min()} to {indices.max()}"
+        )

@@ -1,0 +1,111 @@
+"""A soft body that remembers its shape."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler import _tree
+from jeuler.forces.neighbours import Indices, check_indices
+
+
+@jax.custom_jvp
+def rotation_of(a: Array) -> Array:
+    """The rotation nearest to a square matrix: R in the polar decomposition A = R S with det R = 1.
+
+    Its derivative is R W with W antisymmetric and S W + W S = R^T dA - dA^T R: finite also where singular values
+    coincide, as they do in every undeformed cube, and where the derivative of the SVD is not.
+    """
+    u, _, vt = jnp.linalg.svd(a)
+    flip = jnp.sign(jnp.linalg.det(u @ vt))
+    return u.at[:, -1].multiply(flip) @ vt
+
+
+@rotation_of.defjvp
+def _rotation_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    (a,), (da,) = primals, tangents
+    r = rotation_of(a)
+    return r, r @ turning(r.T @ a, r.T @ da - da.T @ r)
+
+
+def turning(s: Array, skew: Array) -> Array:
+    """The antisymmetric W with S W + W S = skew, for a symmetric S; finite also for a collapsed body, S = 0."""
+    one = jnp.eye(len(s), dtype=s.dtype)
+    small = jnp.finfo(s.dtype).eps * (1 + jnp.abs(jnp.trace(s)))
+    both_sides = jnp.kron(s, one) + jnp.kron(one, s.T) + small * jnp.kron(one, one)
+    return jnp.linalg.solve(both_sides, skew.reshape(-1)).reshape(s.shape)
+
+
+@_tree.component(static=("particles",))
+class ShapeMatching:
+    """A soft body: each particle is pulled to its place in the rest shape, moved and turned as the body is now.
+
+        c = mean of p,   R = the rotation nearest to sum_i (p_i - c) q_i^T,   g_i = c + R q_i
+        F_i = stiffness (g_i - p_i) + damping (mean of v + W (p_i - c) - v_i)
+
+    with q the rest shape about its own mean and W the turning of the body as it is, by least squares. The forces sum
+    to zero and have no torque. A collapsed or inverted body finds back.
+
+    Args:
+      particles: indices of the body, integers (body particle,). Static.
+      rest_position: the rest shape, (body particle, dim), m. Differentiable.
+      stiffness: (), N/m. Differentiable.
+      damping: (), N s/m, of the motion within the body. Differentiable.
+      here: set by a scene with deaths, (body particle,): 1 for the living and 0 for the dead.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+    Raises: ValueError, if the rest shape and the indices disagree; in `simulate`, if an index is out of range.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> square = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+      >>> body = jeuler.ShapeMatching(range(4), square, stiffness=10.0)
+      >>> turned = square @ jnp.array([[0.0, 1.0], [-1.0, 0.0]]) + 5.0
+      >>> bool(jnp.abs(body(0.0, turned, 0 * turned, jnp.asarray(1.0))).max() < 1e-4)
+      True
+
+    Source: M. Mueller, B. Heidelberger, M. Teschner, M. Gross, Meshless Deformations Based on Shape Matching, 2005.
+    """
+
+    particles: Any
+    rest_position: Array
+    stiffness: Array
+    damping: Array = 0.0  # type: ignore[assignment]
+    here: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "particles", Indices(np.asarray(self.particles).reshape(-1)))
+        _tree.store_as_float(self, "rest_position", "stiffness", "damping")
+        if self.rest_position.ndim != 2 or len(self.rest_position) != len(self.particles):
+            raise ValueError(
+                f"ShapeMatching.rest_position must have shape ({len(self.particles)}, dim), one place for each of the "
+                f"body's particles, got {self.rest_position.shape}"
+            )
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        body, dtype = np.asarray(self.particles), position.dtype
+        here = jnp.ones(len(body), dtype) if self.here is None else self.here.astype(dtype)
+        here = here[:, None]
+
+        def about_mean(x):
+            return here * (x - jnp.sum(here * x, axis=0) / jnp.maximum(jnp.sum(here), 1))
+
+        p, v, q = (about_mean(x) for x in (position[body], velocity[body], self.rest_position.astype(dtype)))
+        turn = turning(p.T @ p, v.T @ p - p.T @ v)
+        to_goal, to_rigid = q @ rotation_of(p.T @ q).T - p, p @ turn.T - v
+        force = self.stiffness.astype(dtype) * to_goal + self.damping.astype(dtype) * to_rigid
+        return jnp.zeros_like(position).at[body].add(force)
+
+    def among(self, alive: Array) -> ShapeMatching:
+        """The body of the living only."""
+        return _tree.replace(self, here=alive[np.asarray(self.particles)].astype(self.rest_position.dtype))
+
+    def check(self, particles: int, dim: int) -> None:
+        check_indices("ShapeMatching.particles", self.particles, particles)
+        if self.rest_position.shape[1] != dim:
+            raise ValueError(
+                f"ShapeMatching.rest_position must have shape ({len(self.particles)}, {dim}), "
+                f"got {self.rest_position.shape}"
+            )

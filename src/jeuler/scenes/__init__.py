@@ -1,0 +1,26 @@
+"""Example scenes, each a short function in the library's own terms: read one, change it, make it yours.
+
+    from jeuler import scenes
+    film = scenes.fountain().film("fountain.gif")
+
+They are part of the package, so that notebooks, tests and people all run the same code.
+"""
+
+from jeuler.scenes.bodies import cloth_on_sphere, curly_hair, jelly_on_stairs
+from jeuler.scenes.charge import charge
+from jeuler.scenes.pools import fountain, rain_on_pegs, smoke_column
+from jeuler.scenes.setup import Setup
+
+ALL = (fountain, smoke_column, curly_hair, cloth_on_sphere, jelly_on_stairs, charge, rain_on_pegs)
+
+__all__ = [
+    "ALL",
+    "Setup",
+    "charge",
+    "cloth_on_sphere",
+    "curly_hair",
+    "fountain",
+    "jelly_on_stairs",
+    "rain_on_pegs",
+    "smoke_column",
+]

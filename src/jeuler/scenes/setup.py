@@ -1,0 +1,62 @@
+"""What an example scene gives: the scene, its initial state, how to run it and how to look at it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+
+from jeuler.methods import symplectic_euler_step
+from jeuler.particles import Scene, simulate
+from jeuler.solve import Solution
+from jeuler.state import ParticleState
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """A scene that is ready to run and to be looked at.
+
+    Args:
+      scene, state: what `simulate` takes.
+      dt, num_steps, save_every: how it takes them, dt in s.
+      camera: named arguments of a ``plotting.render.Camera``.
+      background: colour of the picture.
+      frame: the saved state that makes the best picture.
+      step: the method.
+    """
+
+    scene: Scene
+    state: ParticleState
+    dt: float
+    num_steps: int
+    save_every: int
+    camera: dict[str, Any] = dataclasses.field(default_factory=dict)
+    background: str = "white"
+    frame: int = -1
+    step: Any = symplectic_euler_step
+
+    def run(self, seed: int = 0, **changes: Any) -> Solution:
+        """The solution; ``changes`` are arguments of `simulate` to take instead."""
+        arguments = {"dt": self.dt, "num_steps": self.num_steps, "save_every": self.save_every, "step": self.step}
+        key = jax.random.key(seed)
+        return jax.jit(lambda scene, state: simulate(scene, state, key=key, **(arguments | changes)))(
+            self.scene, self.state
+        )
+
+    def film(self, path: Any = None, **options: Any) -> Any:
+        """The film of the run, written to the path (.gif, .mp4, .html) if there is one."""
+        from jeuler.plotting.render import Camera, animate
+
+        look = {"camera": Camera(**self.camera), "background": self.background}
+        return animate(self.run(), self.scene, path, **(look | options))
+
+    def picture(self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any) -> None:
+        """A picture of one saved state of the run, written to the path."""
+        from jeuler.plotting.render import Camera, save_picture
+
+        solution = self.run() if solution is None else solution
+        frame = self.frame if frame is None else frame
+        state = jax.tree.map(lambda x: x[frame], solution.y)
+        look = {"camera": Camera(**self.camera), "background": self.background, "t": float(solution.t[frame])}
+        save_picture(path, state, self.scene, **(look | options))

@@ -1,0 +1,121 @@
+"""Pictures and films: what is drawn is what the state says."""
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib import animation
+from matplotlib import pyplot as plt
+from PIL import Image
+
+from jeuler import ParticleState, Scene, Solution, Springs
+from jeuler.colliders import Box, Plane, Sphere
+from jeuler.effects.collisions import Collisions
+from jeuler.plotting.render import Camera, animate, draw, new_axes
+from jeuler.plotting.solids import in_sight
+
+FRAMES = 4
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def state(dim, **fields):
+    position = np.linspace(0, 1, 3 * dim).reshape(3, dim)
+    return ParticleState(position, 0 * position, **fields)
+
+
+def film(dim=2):
+    position = np.linspace(0, 1, FRAMES * 3 * dim).reshape(FRAMES, 3, dim)
+    y = ParticleState(position, 0 * position, np.ones(FRAMES), alive=np.ones((FRAMES, 3), bool))
+    return Solution(jnp.arange(FRAMES) * 0.1, y, jnp.int32(-1))
+
+
+def test_particles_have_their_colour_opacity_size_and_marker_and_the_dead_are_not_drawn():
+    frame = state(
+        2, alive=[True, True, False], color=[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]], opacity=[0.5, 1.0, 1.0],
+        size=[0.1, 0.2, 0.3], shape=[0, 1, 1],
+    )  # fmt: skip
+    dots = draw(frame, camera=Camera(width=2.0)).collections
+    assert len(dots) == 2, "one for each marker"
+    assert np.allclose(dots[0].get_facecolors(), [[1, 0, 0, 0.5]])
+    assert np.allclose(dots[1].get_facecolors(), [[0, 1, 0, 1]])
+    assert np.isclose(dots[1].get_sizes()[0] / dots[0].get_sizes()[0], 4), "areas go as diameters squared"
+    assert np.allclose(dots[1].get_offsets(), frame.position[1:2])
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_metre_is_as_long_as_the_camera_says(dim):
+    frame = state(dim, size=[0.5] * 3)
+    ax = draw(frame, ax=new_axes(dim, "white", (6.0, 4.5)), camera=Camera(center=[0.0] * dim, width=6.0))
+    diameter = np.sqrt(ax.collections[-1].get_sizes()[0])
+    assert np.isclose(diameter, 0.5 * 72, rtol=0.1), "6 m on 6 inches: half a metre is 36 points"
+
+
+def test_springs_are_coloured_by_strain():
+    frame = ParticleState([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.5, 0.0]], np.zeros((4, 2)))
+    scene = Scene((Springs([[0, 1], [1, 2], [2, 3]], 1.0, 0.0, 1.0),))
+    rest, stretched, pressed = draw(frame, scene).collections[0].get_colors()
+    assert np.ptp(rest[:3]) < 0.05, "grey"
+    assert stretched[0] > 2 * stretched[2]
+    assert pressed[2] > 2 * pressed[0]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_colliders_are_drawn(dim):
+    up = [0.0] * (dim - 1) + [1.0]
+    solids = (Plane([0.5] * dim, up), Sphere([0.5] * dim, 0.2), Box([0.2] * dim, 0.1), lambda t, p: jnp.max(p) - 0.3)
+    for solid in solids:
+        with_solid = draw(state(dim), Scene(effects=(Collisions((solid,)),)))
+        assert len(with_solid.collections) > len(draw(state(dim)).collections)
+
+
+def test_what_a_solid_hides_is_not_drawn():
+    ball = [Sphere([0.0, 0.0, 0.0], 1.0)]
+    points = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [-3.0, 2.0, 0.0], [1.001, 0.0, 0.0]])
+    assert in_sight(ball, 0.0, points, np.array([1.0, 0.0, 0.0]), 8.0).tolist() == [True, False, True, True]
+
+
+def test_a_film_is_written_as_gif_and_html_and_shown_in_a_notebook(tmp_path):
+    animate(film(), path=tmp_path / "film.gif", progress=False, title="t = {t} s")
+    with Image.open(tmp_path / "film.gif") as image:
+        assert image.n_frames == FRAMES
+        assert image.size == (480, 360)
+    player = animate(film(3), every=2, progress=False)
+    assert player.frames == 2
+    html = player._repr_html_()
+    assert html.count("data:image/png;base64") == 2
+    player.save(tmp_path / "film.html")
+    assert (tmp_path / "film.html").stat().st_size == len(html.encode())
+
+
+def test_mp4_needs_ffmpeg_and_says_so(tmp_path, monkeypatch):
+    if animation.FFMpegWriter.isAvailable():
+        animate(film(), path=tmp_path / "film.mp4", progress=False)
+        assert (tmp_path / "film.mp4").stat().st_size > 1000
+    monkeypatch.setattr(animation.FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
+    with pytest.raises(RuntimeError, match=r"film.mp4 needs the program ffmpeg.*write film.gif or film.html"):
+        animate(film(), path=tmp_path / "film.mp4", progress=False)
+
+
+def test_the_camera_follows():
+    frame = state(2)
+    followed = draw(frame, camera=Camera(width=1.0, follow=2))
+    assert np.allclose(np.mean(followed.get_xlim()), frame.position[2, 0])
+    mean = draw(frame, camera=Camera(width=1.0, follow="mean"))
+    assert np.allclose(np.mean(mean.get_ylim()), frame.position[:, 1].mean())
+
+
+def test_a_whole_solution_is_no_frame_and_a_path_has_a_known_end(tmp_path):
+    with pytest.raises(ValueError, match=r"frame.position must have shape \(particle, 2\) .* take one frame"):
+        draw(film().y)
+    with pytest.raises(ValueError, match=r"must end in .gif, .mp4 or .html, got 'film.avi'"):
+        animate(film(), path=tmp_path / "film.avi")
+    with pytest.raises(ValueError, match=r"needs a solution whose .y is a ParticleState"):
+        animate(Solution(jnp.zeros(2), jnp.zeros(2), jnp.int32(-1)))
