@@ -141,10 +141,11 @@ def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> Extrapolat
       1.
     Example:
       >>> import jeuler
-      >>> run = jeuler.solve(lambda t, y, args: y, 1.0, dt=0.25, num_steps=4,
-      step=jeuler.extrapolated_euler(6))
+      >>> step = jeuler.extrapolated_euler(6)
+      >>> run = jeuler.solve(lambda t, y, args: y, 1.0, dt=0.25, num_steps=4, step=step)
       >>> abs(float(run.y[-1]) - 2.718281828) < 2e-6
       True
+
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.9; of
       the linearly implicit step: P. Deuflhard, Recent progress in extrapolation methods, SIAM Review 27,
       1985.
@@ -223,6 +224,7 @@ def solve_adaptive(
       >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=[1.0, 2.0])
       >>> [round(float(y), 5) for y in run.y], bool(run.finished)
       ([1.0, 0.36788, 0.13534], True)
+
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and
       II.9.
     """

@@ -71,10 +71,12 @@ def stability_limit(
       >>> oscillator = lambda t, y, ks: (y[1], -ks * y[0])
       >>> jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0)
       0.0
-      >>> round(jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0, step=jeuler.symplectic_euler_step),
-      6) 0.4
+      >>> step = jeuler.symplectic_euler_step
+      >>> round(jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0, step=step), 6)
+      0.4
       >>> round(jeuler.stability_limit(lambda t, y, args: -50.0 * y, 0.0, 1.0), 6)
       0.04
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.2; W. E. Arnoldi,
       The principle of minimized iterations, Q. Appl. Math. 9, 1951.
     """

@@ -92,7 +92,8 @@ def advise_step(
       >>> import jeuler
       >>> advice = jeuler.advise_step(lambda t, y, args: -y, 1.0, t1=1.0, error=1e-3)
       >>> advice.feasible, advice.num_steps
-      (True, 625)
+      (True, 628)
+
     Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P.
       Henrici, Discrete Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """

@@ -92,6 +92,7 @@ def work_precision(
       ...     reference=lambda t: jnp.exp(-t), repeats=1)
       >>> [(row["method"], row["num_steps"], round(row["error_final"], 4)) for row in table.rows]
       [('Euler', 10, 0.0192), ('Euler', 20, 0.0094)]
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.10,
       work-precision diagrams.
     """

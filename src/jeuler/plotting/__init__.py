@@ -1,1 +1,0 @@
-"""Figures; the only package that imports matplotlib."""
