@@ -125,8 +125,8 @@ def aitken_neville(rows: Array) -> tuple[Array, Array]:
 def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> ExtrapolatedStep:
     """Make a step of any order by extrapolating an Euler step to dt = 0.
 
-        T_{j,1}: j substeps of dt / j;   T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (j / (j - m) - 1);   y
-        = T_kk
+        T_{j,1}: j substeps of dt / j;   y = T_kk
+        T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (j / (j - m) - 1)
 
     The k rows are one vmapped batch, k substeps deep, about k^2 / 2 evaluations of f in all. Of `euler_step`
     it is an explicit Runge-Kutta method of order k; of a linearly implicit Euler step it stays stable on
