@@ -20,7 +20,9 @@ START = jnp.array(2.0), jnp.array(0.0)
 
 
 def published(mu, t1):
-    run = solve_ivp(lambda t, y: van_der_pol(t, y, mu), (0, t1), [2.0, 0.0], method="LSODA", rtol=1e-12, atol=1e-13)
+    run = solve_ivp(
+        lambda t, y: van_der_pol(t, y, mu), (0, t1), [2.0, 0.0], method="LSODA", rtol=1e-12, atol=1e-13
+    )
     return run.y[:, -1]
 
 
@@ -43,7 +45,9 @@ def test_rows_are_the_base_step_in_j_substeps():
         y = START
         for i in range(j):
             y = jeuler.euler_step(van_der_pol, 0.5 + i * dt / j, y, dt / j, 3.0)
-        np.testing.assert_allclose([row[j - 1] for row in rows], [a - b for a, b in zip(y, START, strict=True)], rtol=1e-12)
+        np.testing.assert_allclose(
+            [row[j - 1] for row in rows], [a - b for a, b in zip(y, START, strict=True)], rtol=1e-12
+        )
 
 
 @pytest.mark.parametrize("order", range(1, 13))
@@ -89,13 +93,19 @@ def test_linearly_implicit_rows_solve_a_stiff_problem_that_explicit_ones_cannot(
 
 def test_adaptive_run_meets_its_tolerance_and_agrees_with_lsoda():
     times = [2.0, 5.0, 10.0]
-    run = jax.jit(lambda tolerance: solve_adaptive(van_der_pol, START, t1=times, args=3.0, rtol=tolerance, atol=tolerance))
+    run = jax.jit(
+        lambda tolerance: solve_adaptive(
+            van_der_pol, START, t1=times, args=3.0, rtol=tolerance, atol=tolerance
+        )
+    )
     errors = []
     for tolerance in (1e-4, 1e-7, 1e-10):
         found = run(tolerance)
         assert bool(found.finished)
         np.testing.assert_array_equal(found.t, [0.0, *times])
-        errors.append(max(abs(float(found.y[0][i]) - published(3.0, t)[0]) for i, t in enumerate(times, start=1)))
+        errors.append(
+            max(abs(float(found.y[0][i]) - published(3.0, t)[0]) for i, t in enumerate(times, start=1))
+        )
     assert errors[0] < 1e-2
     assert errors[1] < 1e-5
     assert errors[2] < 1e-8
@@ -103,28 +113,43 @@ def test_adaptive_run_meets_its_tolerance_and_agrees_with_lsoda():
 
 def test_derivatives_of_an_adaptive_run_agree_with_diffrax_in_both_modes():
     def final(mu):
-        return solve_adaptive(van_der_pol, START, t1=4.0, args=mu, rtol=1e-10, atol=1e-10, max_steps=256).y[0][-1]
+        return solve_adaptive(van_der_pol, START, t1=4.0, args=mu, rtol=1e-10, atol=1e-10, max_steps=256).y[
+            0
+        ][-1]
 
     def final_diffrax(mu):
         control = diffrax.PIDController(rtol=1e-11, atol=1e-11)
         term, solver = diffrax.ODETerm(van_der_pol), diffrax.Tsit5()
         adjoint = diffrax.ForwardMode()
         run = diffrax.diffeqsolve(
-            term, solver, 0.0, 4.0, None, START, mu, stepsize_controller=control, adjoint=adjoint, max_steps=100_000
+            term,
+            solver,
+            0.0,
+            4.0,
+            None,
+            START,
+            mu,
+            stepsize_controller=control,
+            adjoint=adjoint,
+            max_steps=100_000,
         )
         return run.ys[0][-1]
 
     reverse = jax.jit(jax.grad(final))(2.0)
     expected = jax.jit(lambda mu: jax.jvp(final_diffrax, (mu,), (1.0,))[1])(2.0)
     assert float(reverse) == pytest.approx(float(expected), rel=1e-6)
-    assert float(jax.jit(lambda mu: jax.jvp(final, (mu,), (1.0,))[1])(2.0)) == pytest.approx(float(reverse), rel=1e-10)
+    assert float(jax.jit(lambda mu: jax.jvp(final, (mu,), (1.0,))[1])(2.0)) == pytest.approx(
+        float(reverse), rel=1e-10
+    )
 
 
 def test_adaptive_run_says_when_it_did_not_finish_and_vmaps():
     short = solve_adaptive(van_der_pol, START, t1=10.0, args=1.0, max_steps=3)
     assert not bool(short.finished)
     assert np.isnan(short.y[0][-1])
-    batch = jax.vmap(lambda mu: solve_adaptive(van_der_pol, START, t1=1.0, args=mu).y[0][-1])(jnp.array([0.5, 5.0]))
+    batch = jax.vmap(lambda mu: solve_adaptive(van_der_pol, START, t1=1.0, args=mu).y[0][-1])(
+        jnp.array([0.5, 5.0])
+    )
     np.testing.assert_allclose(batch, [published(0.5, 1.0)[0], published(5.0, 1.0)[0]], rtol=1e-5)
 
 
@@ -133,9 +158,15 @@ def test_adaptive_run_says_when_it_did_not_finish_and_vmaps():
     [
         (lambda: extrapolated_euler(0), "order must be at least 1"),
         (lambda: extrapolated_euler(40), "at most 12"),
-        (lambda: extrapolated_euler(3, step=jeuler.rk4_step), "must be of order 1, such as euler_step, got rk4_step"),
+        (
+            lambda: extrapolated_euler(3, step=jeuler.rk4_step),
+            "must be of order 1, such as euler_step, got rk4_step",
+        ),
         (lambda: solve_adaptive(van_der_pol, START, t1=0.0, args=1.0), "later than t0"),
-        (lambda: solve_adaptive(van_der_pol, START, t1=1.0, args=1.0, step=jeuler.euler_step), "extrapolated_euler step"),
+        (
+            lambda: solve_adaptive(van_der_pol, START, t1=1.0, args=1.0, step=jeuler.euler_step),
+            "extrapolated_euler step",
+        ),
         (lambda: solve_adaptive(van_der_pol, START, t1=1.0, args=1.0, rtol=-1.0), "rtol must be at least 0"),
     ],
 )

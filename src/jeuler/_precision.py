@@ -17,7 +17,7 @@ def precision(dtype: Any) -> AbstractContextManager:
     double = np.dtype(dtype) == np.float64
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(double)
-    from jax.experimental import enable_x64  # its place before jax 0.8
+    from jax.experimental import enable_x64  # type: ignore[attr-defined]  # its place before jax 0.8
 
     return enable_x64(double)
 

@@ -40,7 +40,9 @@ class ExtrapolatedStep:
         """y(t + dt) - y, what ``solve(compensated=True)`` adds."""
         return self.increment_with_error(f, t, y, dt, args)[0]
 
-    def increment_with_error(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
+    def increment_with_error(
+        self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any
+    ) -> tuple[PyTree, PyTree]:
         """The increment, and the estimated error of the one of order k - 1, T_kk - T_{k,k-1}."""
         rows = self.rows(f, t, y, dt, args)
         if self.order == 1:
@@ -123,28 +125,36 @@ def aitken_neville(rows: Array) -> tuple[Array, Array]:
 def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> ExtrapolatedStep:
     """Make a step of any order by extrapolating an Euler step to dt = 0.
 
-        T_{j,1}: j substeps of dt / j;   T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (j / (j - m) - 1);   y = T_kk
+        T_{j,1}: j substeps of dt / j;   y = T_kk
+        T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (j / (j - m) - 1)
 
-    The k rows are one vmapped batch, k substeps deep, about k^2 / 2 evaluations of f in all. Of `euler_step` it is an
-    explicit Runge-Kutta method of order k; of a linearly implicit Euler step it stays stable on stiff problems.
+    The k rows are one vmapped batch, k substeps deep, about k^2 / 2 evaluations of f in all. Of `euler_step`
+    it is an explicit Runge-Kutta method of order k; of a linearly implicit Euler step it stays stable on
+    stiff problems.
 
     Args:
       order: k, the number of rows and the order, 1 to 12.
       step: a step of order 1 without memory: `euler_step`, an implicit or linearly implicit Euler step.
     Returns: a step for `solve`, ``(f, t, y, dt, args) -> y``, also with compensated sums; its
       ``increment_with_error`` gives the error estimate T_kk - T_{k,k-1} as well, which `solve_adaptive` uses.
-    Raises: ValueError if order is not an integer from 1 to 12, or step is known to be of another order than 1.
+    Raises: ValueError if order is not an integer from 1 to 12, or step is known to be of another order than
+      1.
     Example:
       >>> import jeuler
-      >>> run = jeuler.solve(lambda t, y, args: y, 1.0, dt=0.25, num_steps=4, step=jeuler.extrapolated_euler(6))
+      >>> step = jeuler.extrapolated_euler(6)
+      >>> run = jeuler.solve(lambda t, y, args: y, 1.0, dt=0.25, num_steps=4, step=step)
       >>> abs(float(run.y[-1]) - 2.718281828) < 2e-6
       True
-    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.9; of the
-      linearly implicit step: P. Deuflhard, Recent progress in extrapolation methods, SIAM Review 27, 1985.
+
+    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.9; of
+      the linearly implicit step: P. Deuflhard, Recent progress in extrapolation methods, SIAM Review 27,
+      1985.
     """
     order = _check.count("order", order, least=1)
     if order > 12:
-        raise ValueError(f"order must be at most 12, got {order}; above, its weights amplify roundoff: take a smaller dt")
+        raise ValueError(
+            f"order must be at most 12, got {order}; above, its weights amplify roundoff: take a smaller dt"
+        )
     if getattr(step, "order", 1) != 1:
         name = getattr(step, "__name__", repr(step))
         raise ValueError(f"step must be of order 1, such as euler_step, got {name} of order {step.order}")  # type: ignore[attr-defined]
@@ -160,8 +170,8 @@ class AdaptiveSolution:
       y: the states at these times: a pytree with leading axis saved.
       num_steps: accepted steps, int32 scalar.
       num_rejected: steps tried again with a smaller dt, int32 scalar.
-      error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of its own
-        error, before the equation damps or amplifies it.
+      error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of
+        its own error, before the equation damps or amplifies it.
       finished: whether the last time was reached within max_steps; if not, the states from there on are NaN.
     """
 
@@ -186,12 +196,15 @@ def solve_adaptive(
     dt0: Any = None,
     max_steps: int = 4096,
 ) -> AdaptiveSolution:
-    """Advance y' = f(t, y, args) to given times with steps chosen so that each one's estimated error is allowed.
+    """Advance y' = f(t, y, args) to given times with steps chosen so that each one's estimated error is
+    allowed.
 
-        accept if rms(error / (atol + rtol max(|y|, |y_next|))) <= 1;   dt <- dt min(5, max(0.2, 0.9 rms^(-1/k)))
+        accept if rms(error / (atol + rtol max(|y|, |y_next|))) <= 1;   dt <- dt min(5, max(0.2, 0.9
+        rms^(-1/k)))
 
-    A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
-    block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
+    A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad
+    work (each block is computed again on the way back). The derivative is that of the steps taken; their
+    sizes count as given.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -211,7 +224,9 @@ def solve_adaptive(
       >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=[1.0, 2.0])
       >>> [round(float(y), 5) for y in run.y], bool(run.finished)
       ([1.0, 0.36788, 0.13534], True)
-    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and II.9.
+
+    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and
+      II.9.
     """
     step = extrapolated_euler(6) if step is None else step
     if not hasattr(step, "increment_with_error") or step.order < 2:
@@ -225,7 +240,11 @@ def solve_adaptive(
             raise ValueError(f"{name} must be at least 0, got {tolerance!r}")
     times = jnp.atleast_1d(jnp.asarray(t1, _tree.time_dtype(y0)))
     t0 = jnp.asarray(t0, times.dtype)
-    if not _check.is_traced(times) and not _check.is_traced(t0) and not np.all(np.diff(times, prepend=t0) > 0):
+    if (
+        not _check.is_traced(times)
+        and not _check.is_traced(t0)
+        and not np.all(np.diff(times, prepend=t0) > 0)
+    ):
         raise ValueError(f"t1 must be later than t0={float(t0)} and increase, got {times.tolist()}")
     _check.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if dt0 is None:
@@ -243,10 +262,19 @@ def solve_adaptive(
         good = ratio <= 1
         factor = jnp.where(jnp.isfinite(ratio), 0.9 * jnp.maximum(ratio, 1e-12) ** (-1 / step.order), 0.2)
         wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
-        dt = jnp.where(good & last, jnp.maximum(wanted, dt), wanted)  # a step cut short to stop at a time is no news
+        shortened = good & last  # to stop at a time: no reason for a smaller dt
+        dt = jnp.where(shortened, jnp.maximum(wanted, dt), wanted)
         take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)  # noqa: E731
         t = jnp.where(good, jnp.where(last, end, t + h), t)
-        return t, take(y_next, y), dt, take(_tree.add(error_sum, error), error_sum), accepted + good, rejected + ~good, tried + 1
+        return (
+            t,
+            take(y_next, y),
+            dt,
+            take(_tree.add(error_sum, error), error_sum),
+            accepted + good,
+            rejected + ~good,
+            tried + 1,
+        )
 
     def to_time(carry, end):
         carry = (*carry, jnp.int32(0))
@@ -287,8 +315,8 @@ def first_step(y: PyTree, slope: PyTree, interval: Array) -> Array:
 def bounded_while(going: Callable, body: Callable, carry: PyTree, most: int, width: int = 16) -> PyTree:
     """``while going(carry): carry = body(carry)``, at most ``most`` times, with a reverse mode.
 
-    A tree of scans of ``width`` branches; a branch that begins after the end is skipped whole, and its states are
-    computed again, not kept, on the way back.
+    A tree of scans of ``width`` branches; a branch that begins after the end is skipped whole, and its states
+    are computed again, not kept, on the way back.
     """
 
     def guarded(work):

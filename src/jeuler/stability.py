@@ -19,7 +19,9 @@ from jeuler.methods import Step, VectorField, euler_step
 PyTree = Any
 
 DENSE = 512  # numbers in the state up to which all eigenvalues are computed
-NEUTRAL = 4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
+NEUTRAL = (
+    4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
+)
 UNDAMPED = 1e-10  # |real part| below this part of the largest eigenvalue is zero up to roundoff
 ROUNDOFF = 1e-15  # |R| - 1 below this is 0
 EXTREMES = 8  # eigenvalues asked for at each end of a large spectrum
@@ -38,17 +40,20 @@ def stability_limit(
 
         |R(dt lambda)| <= 1 for every eigenvalue lambda of df/dy (t, y)
 
-    R, the amplification of the step on y' = lambda y, is found by applying the step itself to that problem, so any
-    step has a limit: explicit, implicit, or one of your own. A step on pairs (position, velocity) that treats the two
-    differently, such as `symplectic_euler_step`, is applied to x'' = -k x - c x' instead, one (k, c) a mode.
+    R, the amplification of the step on y' = lambda y, is found by applying the step itself to that problem,
+    so any step has a limit: explicit, implicit, or one of your own. A step on pairs (position, velocity) that
+    treats the two differently, such as `symplectic_euler_step`, is applied to x'' = -k x - c x' instead, one
+    (k, c) a mode.
 
-    Explicit Euler: dt <= -2 Re(lambda) / |lambda|^2, so 2 z / omega for an oscillator of damping ratio z < 1, and 0
-    without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no limit, inf.
+    Explicit Euler: dt <= -2 Re(lambda) / |lambda|^2, so 2 z / omega for an oscillator of damping ratio z < 1,
+    and 0 without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no
+    limit, inf.
 
     The limit belongs to the state: look at it where the system is stiffest. Eigenvalues that are 0
-    up to the roundoff of the data (a system that can drift) do not count. Up to 512 numbers in the state all eigenvalues are computed; above, Arnoldi iteration on
-    Jacobian-vector products finds those of the largest modulus, real part and imaginary part, and the limit is that
-    of these. Computed in float64 on the host, so it is not for use under jit.
+    up to the roundoff of the data (a system that can drift) do not count. Up to 512 numbers in the state all
+    eigenvalues are computed; above, Arnoldi iteration on Jacobian-vector products finds those of the largest
+    modulus, real part and imaginary part, and the limit is that of these. Computed in float64 on the host, so
+    it is not for use under jit.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -56,26 +61,31 @@ def stability_limit(
       y: state, any pytree of floating or complex arrays.
       args: passed to f.
       step: the method.
-      growing: "unstable": where the equation itself grows (Re lambda > 0) no dt is stable, 0.0; "skip": the growth is
-        the solution's own and only the other eigenvalues count.
+      growing: "unstable": where the equation itself grows (Re lambda > 0) no dt is stable, 0.0; "skip": the
+        growth is the solution's own and only the other eigenvalues count.
     Returns: the limit, s, a float; 0.0 when no dt is stable, inf when every dt is.
-    Raises: ValueError if y or t is traced, if f does not return the form of y, or if its Jacobian is not finite.
+    Raises: ValueError if y or t is traced, if f does not return the form of y, or if its Jacobian is not
+      finite.
     Example:
       >>> import jeuler
       >>> oscillator = lambda t, y, ks: (y[1], -ks * y[0])
       >>> jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0)
       0.0
-      >>> round(jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0, step=jeuler.symplectic_euler_step), 6)
+      >>> step = jeuler.symplectic_euler_step
+      >>> round(jeuler.stability_limit(oscillator, 0.0, (1.0, 0.0), 25.0, step=step), 6)
       0.4
       >>> round(jeuler.stability_limit(lambda t, y, args: -50.0 * y, 0.0, 1.0), 6)
       0.04
-    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.2; W. E. Arnoldi, The
-      principle of minimized iterations, Q. Appl. Math. 9, 1951.
+
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.2; W. E. Arnoldi,
+      The principle of minimized iterations, Q. Appl. Math. 9, 1951.
     """
     if growing not in ("unstable", "skip"):
         raise ValueError(f'growing must be "unstable" or "skip", got {growing!r}')
     if any(map(_check.is_traced, jax.tree.leaves((t, y, args)))):
-        raise ValueError("stability_limit must be called with values, got traced ones; call it outside jit, grad, vmap")
+        raise ValueError(
+            "stability_limit must be called with values, got traced ones; call it outside jit, grad, vmap"
+        )
     _check.number("t", t)
     y = _check.state("y", y)
     _check.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
@@ -85,10 +95,11 @@ def stability_limit(
 
 
 class Linearisation:
-    """The linear field J u around states of one form: as products, as a matrix where it is small, by its modes."""
+    """The linear field J u around states of one form: as products, as a matrix where it is small, by its
+    modes."""
 
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
-        self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # of the precision of the data
+        self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # the data's own roundoff
         y, args = cast(y, np.float64), cast(args, np.float64)
         leaves, structure = jax.tree.flatten(y)
         split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
@@ -115,7 +126,8 @@ class Linearisation:
     def limits(
         self, t: Any, flat: Any, step: Step, *, growing: str = "skip", interval: float = math.inf
     ) -> tuple[float, float]:
-        """The largest stable dt at a state, and the largest at which no stable mode grows beyond e within an interval."""
+        """The largest stable dt at a state, and the largest at which no stable mode grows beyond e within an
+        interval."""
         rates, modes, matrix = self.eigen(t, flat)
         scale = np.abs(rates).max(initial=0.0)
         moving = np.abs(rates) > self.neutral * scale
@@ -125,7 +137,9 @@ class Linearisation:
         counts = moving & ~grows
         if not counts.any():
             return math.inf, math.inf
-        chosen = np.resize(np.flatnonzero(counts), rates.size)  # always as many, so that one program serves all states
+        chosen = np.resize(
+            np.flatnonzero(counts), rates.size
+        )  # always as many, so that one program serves all states
         rates, modes = rates[chosen], modes[:, chosen]
         rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
         if treats_all_alike(step):
@@ -134,16 +148,20 @@ class Linearisation:
             return limit, max(limit, bound)
         stiffness, damping = self.modal(t, flat, rates, modes)
         limit = float(np.min(pair_limits(step, stiffness, damping)))
-        bound = limit if math.isinf(interval) else float(np.min(pair_limits(step, stiffness, damping, interval)))
+        bound = (
+            limit if math.isinf(interval) else float(np.min(pair_limits(step, stiffness, damping, interval)))
+        )
         return (limit if matrix is None else self.refined(step, matrix, limit)), max(limit, bound)
 
     def eigen(self, t: Any, flat: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is small."""
+        """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is
+        small."""
         n = self.flat.size
         matrix = np.asarray(self.products(t, flat, jnp.eye(n))) if n <= DENSE else None
         if not np.all(np.isfinite(self.product(t, flat, jnp.ones(n)) if matrix is None else matrix)):
             raise ValueError(
-                "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; give a state at which f is smooth"
+                "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; "
+                "give a state at which f is smooth"
             )
         if matrix is not None:
             rates, modes = np.linalg.eig(matrix)
@@ -157,7 +175,9 @@ class Linearisation:
         found = []
         for which in ("LM", "LR", "LI"):
             try:
-                found.append(eigs(operator, k=EXTREMES, which=which, v0=start, tol=1e-6, maxiter=20 * EXTREMES))
+                found.append(
+                    eigs(operator, k=EXTREMES, which=which, v0=start, tol=1e-6, maxiter=20 * EXTREMES)
+                )
             except ArpackNoConvergence as partial:
                 found.append((partial.eigenvalues, partial.eigenvectors))
         return np.concatenate([r for r, _ in found]), np.concatenate([v for _, v in found], axis=1), None
@@ -172,7 +192,9 @@ class Linearisation:
         still = np.zeros_like(shape)
 
         def quotient(direction):
-            real, imaginary = (self.products(t, flat, jnp.asarray(part)) for part in (direction.real, direction.imag))
+            real, imaginary = (
+                self.products(t, flat, jnp.asarray(part)) for part in (direction.real, direction.imag)
+            )
             image = np.asarray(real)[half:] + 1j * np.asarray(imaginary)[half:]
             return (-np.sum(shape.conj() * image, axis=0) / np.sum(np.abs(shape) ** 2, axis=0)).real
 
@@ -246,7 +268,7 @@ def _unit_pairs():
 
 
 @functools.lru_cache(maxsize=64)
-def treats_all_alike(step: Step) -> bool:
+def treats_all_alike(step: Any) -> bool:
     """Whether the step commutes with a linear change of variables, so that eigenvalues say all about it."""
 
     @jax.jit
@@ -269,7 +291,9 @@ def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> 
     return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
 
 
-def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf) -> np.ndarray:
+def pair_limits(
+    step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf
+) -> np.ndarray:
     """The largest stable dt of each mode x'' = -k x - c x'."""
     size = np.sqrt(np.abs(stiffness)) + np.abs(damping)
     gain = functools.partial(_pair_gain, step, stiffness / size**2, damping / size)
@@ -277,11 +301,13 @@ def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval
 
 
 def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
-    """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if endless.
+    """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if
+    endless.
 
-    gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|, (mode,).
+    gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|,
+      (mode,).
     """
-    points, lasting = 801, 25  # 50 points a decade; a gain above 1 over half a decade is not the noise of a solve
+    points, lasting = 801, 25  # 50 a decade; above 1 over half a decade is no noise of a solve
     modes = len(growth)
     s = np.broadcast_to(np.logspace(-8, 8, points), (modes, points))
 
@@ -291,11 +317,11 @@ def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) 
 
     above = excess(s)
     unstable = above > ROUNDOFF
-    lasts = np.stack([unstable[:, k : points - lasting + k] for k in range(lasting)]).all(0)
-    first = lasts.argmax(1)
-    limits = np.where(lasts.any(1), 0.0, np.inf)
-    for mode in np.flatnonzero(lasts.any(1) & (first > 0)):
-        # growth as s^2 or s^4 is below roundoff at small s: an interval without decay counts only if it is long
+    lasts = np.stack([unstable[:, k : points - lasting + k] for k in range(lasting)]).all(axis=0)
+    first, ends = np.argmax(lasts, axis=1), np.any(lasts, axis=1)
+    limits = np.where(ends, 0.0, np.inf)
+    for mode in np.flatnonzero(ends & (first > 0)):
+        # growth as s^2 or s^4 is below roundoff at small s: an interval without decay counts only if long
         decay = above[mode, : first[mode]].min()
         if decay < -4 * ROUNDOFF or s[mode, first[mode]] > 0.05:
             limits[mode] = s[mode, first[mode]]

@@ -1,4 +1,5 @@
-"""Work-precision tables: errors against exact solutions, orders, floors, gradients, rows that failed, the figure."""
+"""Work-precision tables: errors against exact solutions, orders, floors, gradients, rows that failed, the
+figure."""
 
 import csv
 import math
@@ -73,7 +74,9 @@ def test_every_method_has_every_dt_in_every_precision(table):
     assert len(table.rows) == 2 * (6 * 2 + 2)  # two methods can also choose their own steps
     assert all(set(row) == set(EMPTY_ROW) for row in table.rows)
     assert all(row["reason"] == "" and len(row["run_seconds"]) == 2 for row in table.rows)
-    assert all(row["run_seconds_min"] == min(row["run_seconds"]) > 0 < row["compile_seconds"] for row in table.rows)
+    assert all(
+        row["run_seconds_min"] == min(row["run_seconds"]) > 0 < row["compile_seconds"] for row in table.rows
+    )
 
 
 def test_evaluations_are_counted(table):
@@ -108,7 +111,9 @@ def test_the_table_can_be_written_read_and_drawn(table, tmp_path):
         read = list(csv.DictReader(file))
     assert [row["method"] for row in read] == [row["method"] for row in table.rows]
     assert [float(row["error_final"]) for row in read] == [row["error_final"] for row in table.rows]
-    assert [tuple(map(float, row["run_seconds"].split())) for row in read] == [r["run_seconds"] for r in table.rows]
+    assert [tuple(map(float, row["run_seconds"].split())) for row in read] == [
+        r["run_seconds"] for r in table.rows
+    ]
     text = table.to_markdown()
     assert len(text.splitlines()) == 2 + 6 * 2 + 2
     assert "float32" in text.splitlines()[0]
@@ -123,7 +128,9 @@ def test_the_table_can_be_written_read_and_drawn(table, tmp_path):
 
 
 def test_without_a_reference_diffrax_gives_one_and_says_how_far_to_trust_it():
-    table = work_precision(oscillator, (1.0, 0.0), t1=1.0, dts=[0.1], steps=[jeuler.rk4_step], args=4.0, repeats=1)
+    table = work_precision(
+        oscillator, (1.0, 0.0), t1=1.0, dts=[0.1], steps=[jeuler.rk4_step], args=4.0, repeats=1
+    )
     (row,) = table.rows
     assert row["method"] == "rk4"
     run = jeuler.solve(oscillator, (1.0, 0.0), dt=0.1, num_steps=10, args=4.0, step=jeuler.rk4_step)
@@ -157,7 +164,13 @@ def test_gradient_is_compared_timed_and_weighed():
 
 def test_a_run_that_blows_up_is_a_row_with_its_reason():
     table = work_precision(
-        lambda t, y, args: y**2, 1.0, t1=3.0, dts=[0.01], steps={"euler": jeuler.euler_step}, reference=0.0, repeats=1
+        lambda t, y, args: y**2,
+        1.0,
+        t1=3.0,
+        dts=[0.01],
+        steps={"euler": jeuler.euler_step},
+        reference=0.0,
+        repeats=1,
     )
     (row,) = table.rows
     assert math.isnan(row["error_final"])
@@ -232,7 +245,12 @@ def test_floor_order_and_front_of_made_up_numbers():
     ],
 )
 def test_bad_input_is_told(change, message):
-    given = {"t1": 1.0, "dts": [0.1], "steps": {"euler": jeuler.euler_step}, "reference": lambda t: np.exp(-t)}
+    given = {
+        "t1": 1.0,
+        "dts": [0.1],
+        "steps": {"euler": jeuler.euler_step},
+        "reference": lambda t: np.exp(-t),
+    }
     with pytest.raises(ValueError, match=message):
         work_precision(lambda t, y, args: -y, 1.0, **(given | change))
 

@@ -31,11 +31,12 @@ class StepAdvice:
     Attributes:
       dt: the step size to use, s, a whole part of t1 - t0; NaN if not feasible.
       num_steps: steps of that size from t0 to t1; 0 if not feasible.
-      predicted_error: the error at t1 to expect at that dt, in the terms of the target; if not feasible, the least
-        error known to be within reach, or NaN.
+      predicted_error: the error at t1 to expect at that dt, in the terms of the target; if not feasible, the
+        least error known to be within reach, or NaN.
       stability_limit: the largest stable dt, s, over sampled states of the run; 0.0 if no dt is (an undamped
         oscillation under `euler_step` grows at any dt, slowly at a small one), inf if every dt is.
-      roundoff_floor: the error at t1 below which this step in this precision does not get, in the terms of the target.
+      roundoff_floor: the error at t1 below which this step in this precision does not get, in the terms of
+        the target.
       feasible: whether dt meets the target.
       reason: what set dt, or why there is none and what could meet the target.
     """
@@ -66,10 +67,11 @@ def advise_step(
 
         error = |y_dt(t1) - y(t1)| / |y(t1)|,  Euclidean norms over all numbers of the state
 
-    Pilot runs with 16, 32, 64, ... steps are extrapolated to dt = 0 (Richardson). Their errors against that state give
-    the dt; a further run at that dt confirms it. Finer targets than the pilots reach are predicted by the order of the
-    step, where the errors have been seen to follow it. Pilots run in float64 whatever the precision of y0; how far
-    roundoff lets a run in the precision of y0 get is measured on the difference between the two.
+    Pilot runs with 16, 32, 64, ... steps are extrapolated to dt = 0 (Richardson). Their errors against that
+    state give the dt; a further run at that dt confirms it. Finer targets than the pilots reach are predicted
+    by the order of the step, where the errors have been seen to follow it. Pilots run in float64 whatever the
+    precision of y0; how far roundoff lets a run in the precision of y0 get is measured on the difference
+    between the two.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -79,18 +81,21 @@ def advise_step(
       t0: initial time, s.
       args: passed to f.
       step: the method.
-      relative: the target is relative to the norm of the state at t1 (True), or in the units of the state (False).
+      relative: the target is relative to the norm of the state at t1 (True), or in the units of the state
+        (False).
       compensated: advise for compensated sums.
-      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work.
+      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of
+        work.
     Returns: `StepAdvice`; it refuses, ``feasible=False`` with the reason, rather than guess.
     Raises: ValueError, naming the argument, what was expected and what came.
     Example:
       >>> import jeuler
       >>> advice = jeuler.advise_step(lambda t, y, args: -y, 1.0, t1=1.0, error=1e-3)
       >>> advice.feasible, advice.num_steps
-      (True, 625)
-    Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P. Henrici, Discrete
-      Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
+      (True, 628)
+
+    Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P.
+      Henrici, Discrete Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
     y0 = _check.state("y0", y0)
     for name, value in (("t0", t0), ("t1", t1)):
@@ -99,12 +104,16 @@ def advise_step(
         raise ValueError(f"t1 must be later than t0={float(t0):g}, got {float(t1):g}")
     _check.positive("error", error)
     if any(map(_check.is_traced, jax.tree.leaves((y0, args)))):
-        raise ValueError("advise_step must be called with values, got traced ones; call it outside jit, grad, vmap")
+        raise ValueError(
+            "advise_step must be called with values, got traced ones; call it outside jit, grad, vmap"
+        )
     _check.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if max_pilot_steps is None:
         max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))
     max_pilot_steps = _check.count("max_pilot_steps", max_pilot_steps, least=64)
-    return _Adviser(f, y0, float(t0), float(t1), args, step, float(error), relative, compensated, max_pilot_steps).advise()
+    return _Adviser(
+        f, y0, float(t0), float(t1), args, step, float(error), relative, compensated, max_pilot_steps
+    ).advise()
 
 
 class _Adviser:
@@ -129,21 +138,25 @@ class _Adviser:
         while start * self.bound < self.interval:
             start *= 2
         if 2 * start > self.most:
-            return self._refuse(f"{self._stability_asks()}, more than pilot runs of {self.most:,} can look into")
+            return self._refuse(
+                f"{self._stability_asks()}, more than pilot runs of {self.most:,} can look into"
+            )
         ladder = self._climb(start)
         if ladder is None:
             if self.bound * self.most < 16 * self.interval:
-                return self._refuse(f"{self._stability_asks()}; pilot runs of {self.most:,} cannot tell its error")
+                return self._refuse(
+                    f"{self._stability_asks()}; pilot runs of {self.most:,} cannot tell its error"
+                )
             return self._refuse(
-                f"the error of {self.name} did not fall as its order says within {self.most:,} steps, so none can be "
-                f"predicted; use {self._finer_step()} or an adaptive solver, or raise max_pilot_steps"
+                f"the error of {self.name} did not fall as its order says within {self.most:,} steps, so "
+                f"none can be predicted; use {self._finer_step()} or an adaptive solver, or raise max_pilot_steps"
             )
         return self._answer(ladder)
 
     def _stability_asks(self) -> str:
         need = f"dt <= {self.bound:.3g} s, {self.interval / self.bound:.3g} steps"
         if self.stability < 0.5 * self.bound:  # an oscillation that the step makes grow
-            return f"oscillations that {self.name} makes grow ask for {need} (use rk4_step or symplectic_euler_step)"
+            return f"oscillations that {self.name} makes grow ask for {need} (rk4_step damps them)"
         return f"stability alone asks for {need} (use implicit_euler_step or linearly_implicit_euler_step)"
 
     def _finer_step(self) -> str:
@@ -152,7 +165,7 @@ class _Adviser:
     def _order(self) -> int:
         return int(getattr(self.step, "order", 1))
 
-    def _scale(self, final: np.ndarray) -> float:
+    def _scale(self, final: Any) -> float:
         return float(np.linalg.norm(final)) if self.relative else 1.0
 
     def _look_at_stability(self, states: np.ndarray, times: np.ndarray) -> None:
@@ -165,7 +178,8 @@ class _Adviser:
                 self.stability, self.bound = min(self.stability, limit), min(self.bound, bound)
 
     def _climb(self, num_steps: int) -> Ladder | None:
-        """Double the steps until the error of the finest run is known and either meets the target or follows the order."""
+        """Double the steps until the error of the finest run is known and either meets the target or follows
+        the order."""
         ladder, looked = Ladder(self._order()), False
         while num_steps <= self.most:
             states = self.pilot(num_steps)
@@ -182,19 +196,25 @@ class _Adviser:
         return None
 
     def _trusted(self, ladder: Ladder) -> bool:
-        """Whether the extrapolated state is known well enough, now and one run before, to judge the target."""
+        """Whether the extrapolated state is known well enough, now and one run before, to judge the
+        target."""
         if ladder.best is None or not np.all(np.isfinite(ladder.best)):
             return False
         scale = self._scale(ladder.best)
         target = self.error * scale
         orders = ladder.observed_orders()[-2:]
-        falling = np.all(orders > 0.5 * self._order()) or ladder.errors()[-1] < 1e-13 * np.linalg.norm(ladder.best)
+        falling = np.all(orders > 0.5 * self._order()) or ladder.errors()[-1] < 1e-13 * np.linalg.norm(
+            ladder.best
+        )
         return scale > 0 and falling and ladder.doubt <= TRUST * max(target, ladder.errors()[-1])
 
     def _regular(self, ladder: Ladder) -> bool:
         """Whether the last errors fall as the order says, so that finer ones may be predicted."""
         orders = ladder.observed_orders()[-3:]
-        return bool(np.all(np.abs(orders - self._order()) < REGULAR)) and ladder.doubt <= TRUST * ladder.errors()[-1]
+        return (
+            bool(np.all(np.abs(orders - self._order()) < REGULAR))
+            and ladder.doubt <= TRUST * ladder.errors()[-1]
+        )
 
     def _answer(self, ladder: Ladder) -> StepAdvice:
         scale = self._scale(ladder.best)
@@ -212,7 +232,9 @@ class _Adviser:
             num_steps, how = least, "set by stability, which asks for more than the target does"
             predicted = float(np.linalg.norm(self.pilot(num_steps)[-1] - ladder.best))
         elif predicted < aim / 3:
-            how = "set by stability: with fewer steps the run is lost, with these it is better than the target"
+            how = (
+                "set by stability: with fewer steps the run is lost, with these it is better than the target"
+            )
         self.floor = rounding.least_total(predicted / scale * num_steps**p, p)
         total = predicted / scale + rounding.at(num_steps)
         if total > 1.25 * self.error:
@@ -220,14 +242,14 @@ class _Adviser:
             cures += ["float64"] if self.dtype == np.float32 else []
             cures += [self._finer_step()]
             return self._refuse(
-                f"roundoff: in {self.dtype} {self.name} does not get below an error of about {self.floor:.1e}, above the "
-                f"target {self.error:.1e}; use {' or '.join(cures)}",
+                f"roundoff: in {self.dtype} {self.name} does not get below an error of about "
+                f"{self.floor:.1e}, above the target {self.error:.1e}; use {' or '.join(cures)}",
                 self.floor,
             )
         if num_steps > COUNTER:
             return self._refuse(
-                f"the target asks for {num_steps:.3g} steps, more than the clock can count; use {self._finer_step()} or an "
-                f"adaptive solver"
+                f"the target asks for {num_steps:.3g} steps, more than the clock can count; "
+                f"use {self._finer_step()} or an adaptive solver"
             )
         reason = f"{num_steps:,} steps: {how}"
         if how.startswith("predicted") and num_steps > 10_000_000 and p == 1:
@@ -243,7 +265,9 @@ class _Adviser:
         while rung > 0 and errors[rung - 1] <= aim:
             rung -= 1
         high, error_high = ladder.num_steps[rung], float(errors[rung])
-        low, error_low = (ladder.num_steps[rung - 1], float(errors[rung - 1])) if rung else (high // 2, math.inf)
+        low, error_low = (
+            (ladder.num_steps[rung - 1], float(errors[rung - 1])) if rung else (high // 2, math.inf)
+        )
         for _ in range(6):
             if high - low <= 1 or error_high > 0.85 * aim:
                 break
@@ -296,7 +320,7 @@ class Rounding:
         size = float(np.exp(np.mean(np.log(error) - growth * np.log(num_steps))))
         return cls(size * finer, 1.0, growth)
 
-    def at(self, num_steps: float) -> float:
+    def at(self, num_steps: Any) -> Any:
         return self.size * num_steps**self.growth
 
     def least_total(self, truncation: float, order: int) -> float:

@@ -1,4 +1,5 @@
-"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given times."""
+"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given
+times."""
 
 from __future__ import annotations
 
@@ -56,7 +57,9 @@ def named(steps: Any) -> dict[str, Any]:
     for name, method in named.items():
         inner = method.step if isinstance(method, Compensated) else method
         if not (callable(inner) or is_diffrax(inner)):
-            raise ValueError(f"steps[{name!r}] must be a step (f, t, y, dt, args) -> y or a diffrax solver, got {method!r}")
+            raise ValueError(
+                f"steps[{name!r}] must be a step (f, t, y, dt, args) -> y or a diffrax solver, got {method!r}"
+            )
     if not named:
         raise ValueError("steps must name at least one method, got none")
     return named
@@ -81,14 +84,24 @@ class FixedRun:
         """The times of the states kept."""
         return self.t0 + self.num_steps * self.dt * (np.arange(self.saved + 1) / self.saved)
 
-    def __call__(self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None) -> tuple[PyTree, jax.Array, jax.Array]:
+    def __call__(
+        self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None
+    ) -> tuple[PyTree, jax.Array, jax.Array]:
         """States at the times, first non-finite step (-1 none), steps taken."""
         if is_diffrax(self.method):
             import diffrax
 
             times = jnp.asarray(self.times, _time_dtype(y0))
             return _diffrax(
-                f, y0, args, self.method, times, self.dt, diffrax.ConstantStepSize(), self.num_steps + 8, adjoint
+                f,
+                y0,
+                args,
+                self.method,
+                times,
+                self.dt,
+                diffrax.ConstantStepSize(),
+                self.num_steps + 8,
+                adjoint,
             )
         compensated = isinstance(self.method, Compensated)
         run = solve(
@@ -118,7 +131,9 @@ class AdaptiveRun:
     def times(self) -> np.ndarray:
         return np.array([self.t0, self.t1])
 
-    def __call__(self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None) -> tuple[PyTree, jax.Array, jax.Array]:
+    def __call__(
+        self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None
+    ) -> tuple[PyTree, jax.Array, jax.Array]:
         if isinstance(self.method, ExtrapolatedStep):
             run = solve_adaptive(
                 f,
@@ -171,11 +186,15 @@ def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
     return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
 
 
-def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[Callable]:
-    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps are taken.
+def evaluations(
+    plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree
+) -> list[Callable]:
+    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps
+    are taken.
 
-    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and scaled to
-    the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not counted.
+    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and
+    scaled to the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not
+    counted.
     """
 
     def counter(make_run: Callable) -> Callable:

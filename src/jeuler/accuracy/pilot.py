@@ -1,9 +1,11 @@
-"""Pilot runs: the final state for any number of steps from one compiled program, and what a ladder of them says."""
+"""Pilot runs: the final state for any number of steps from one compiled program, and what a ladder of them
+says."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from typing import Any
 
 import jax
@@ -23,7 +25,15 @@ class Pilot:
     """Runs of one step on one problem; the number of steps is an input of the program, not a part of it."""
 
     def __init__(
-        self, f: VectorField, y0: PyTree, t0: float, t1: float, args: PyTree, step: Step, dtype: Any, compensated: bool
+        self,
+        f: VectorField,
+        y0: PyTree,
+        t0: float,
+        t1: float,
+        args: PyTree,
+        step: Step,
+        dtype: Any,
+        compensated: bool,
     ) -> None:
         self.dtype, self.interval = dtype, t1 - t0
         advance = advance_by(step, compensated=compensated)
@@ -54,7 +64,8 @@ class Pilot:
 
 @dataclasses.dataclass
 class Ladder:
-    """Final states for numbers of steps that double, and their extrapolation to dt = 0 (Richardson, Aitken-Neville).
+    """Final states for numbers of steps that double, and their extrapolation to dt = 0 (Richardson,
+    Aitken-Neville).
 
     T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (2^(p+m-1) - 1),  p the order of the step
     """
@@ -78,7 +89,7 @@ class Ladder:
         column = self.finals[-6:]
         for m in range(min(5, len(column) - 1)):
             factor = 2.0 ** (self.order + m) - 1
-            finer = [b + (b - a) / factor for a, b in zip(column, column[1:], strict=False)]
+            finer = [b + (b - a) / factor for a, b in itertools.pairwise(column)]
             # two entries of the new column must agree, or one new entry be near the column before
             change = np.linalg.norm(finer[-1] - (finer[-2] if len(finer) > 1 else column[-1]))
             if change < self.doubt:
@@ -95,5 +106,3 @@ class Ladder:
         """log2 of the ratio of the errors of neighbours."""
         errors = np.maximum(self.errors(), 1e-300)
         return np.log2(errors[:-1] / errors[1:])
-
-

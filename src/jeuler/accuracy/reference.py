@@ -1,4 +1,5 @@
-"""What errors are measured against: an exact solution, a given one, or an accurate solver; always in float64."""
+"""What errors are measured against: an exact solution, a given one, or an accurate solver; always in
+float64."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ class Reference:
     Attributes:
       times: (time,), s.
       states: (time, number), the numbers of y in one row each; NaN where nothing is known.
-      error: how far the states may be trusted: the norm of the last one's change from the looser tolerance; 0.0 for
-        an exact or a given reference.
+      error: how far the states may be trusted: the norm of the last one's change from the looser tolerance;
+        0.0 for an exact or a given reference.
     """
 
     times: np.ndarray
@@ -49,8 +50,9 @@ def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, tim
         loose, tight = (flat_rows(run(tolerance)) for tolerance in TOLERANCES)
         if not np.all(np.isfinite(tight)):
             raise ValueError(
-                f"reference must be finite, got NaN or inf from {type(solver).__name__} at tolerance {TOLERANCES[1]}; give "
-                f"an exact solution as a function of t, or a stiff solver such as diffrax.Kvaerno5()"
+                f"reference must be finite, got NaN or inf from {type(solver).__name__} at tolerance "
+                f"{TOLERANCES[1]}; give an exact solution as a function of t, or a stiff solver such as "
+                "diffrax.Kvaerno5()"
             )
         return Reference(times, tight, float(np.linalg.norm(tight[-1] - loose[-1])))
     if callable(reference):
@@ -61,14 +63,15 @@ def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, tim
         states[0], states[-1] = flat(y0) if final.size == flat(y0).size else np.nan, final
     if states.shape[1] != flat(y0).size:
         raise ValueError(
-            f"reference must have the numbers of y0, {flat(y0).size}, got {states.shape[1]}; give a function of t that "
-            f"returns a state, or the state at t1"
+            f"reference must have the numbers of y0, {flat(y0).size}, got {states.shape[1]}; give a function "
+            f"of t that returns a state, or the state at t1"
         )
     return Reference(times, states, 0.0)
 
 
 def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, tolerance: Any) -> PyTree:
-    """States at the times by an adaptive diffrax solver that steps exactly to each of them. Differentiable."""
+    """States at the times by an adaptive diffrax solver that steps exactly to each of them.
+    Differentiable."""
     import diffrax
 
     control = diffrax.PIDController(rtol=tolerance, atol=tolerance * max(np.linalg.norm(flat(y0)), 1e-3))
@@ -115,7 +118,8 @@ def make_reference_gradient(
 
 
 def error_norms(states: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Euclidean norms of the error over all numbers of the state: at the end, largest, and root mean square in time."""
+    """Euclidean norms of the error over all numbers of the state: at the end, largest, and root mean square
+    in time."""
     error, size = np.linalg.norm(states - reference, axis=1), np.linalg.norm(reference, axis=1)
     weights = np.ones(len(error))
     weights[[0, -1]] = 0.5  # the trapezoidal rule on even times
@@ -124,5 +128,7 @@ def error_norms(states: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     scale = {"final": float(size[-1]), "max": float(size.max()), "l2": mean_square(size)}
     norms = {f"error_{name}": value for name, value in absolute.items()}
     with np.errstate(divide="ignore", invalid="ignore"):
-        norms |= {f"error_{name}_relative": float(np.divide(absolute[name], scale[name])) for name in absolute}
+        norms |= {
+            f"error_{name}_relative": float(np.divide(absolute[name], scale[name])) for name in absolute
+        }
     return norms

@@ -50,7 +50,8 @@ class Summary:
       order: slope of log error against log dt, from the points above the floor; NaN with fewer than two.
       roundoff_floor: the error below which more steps do not get; NaN if the sweep did not reach it.
       floor_dt: the dt at which more steps stop helping, s; NaN if the sweep did not reach it.
-      stability_limit: largest stable dt at the initial state, s; inf if none, 0.0 if no dt is, NaN if unknown.
+      stability_limit: largest stable dt at the initial state, s; inf if none, 0.0 if no dt is, NaN if
+        unknown.
     """
 
     method: str
@@ -66,13 +67,13 @@ class WorkPrecision:
     """Error against seconds, one row a run.
 
     Attributes:
-      rows: a list of dictionaries, ready for ``pandas.DataFrame(table.rows)``: method, dtype, dt (s; NaN for adaptive
-        runs), tolerance (NaN for fixed steps), num_steps, evaluations (of f), compile_seconds, run_seconds (every
-        repeat), run_seconds_min, run_seconds_median; error_final, error_max, error_l2 (Euclidean norm over the state;
-        at t1, largest over the saved times, root mean square over them) and each with _relative; gradient_error,
-        gradient_error_relative, gradient_compile_seconds, gradient_seconds, gradient_seconds_min,
-        gradient_seconds_median, gradient_bytes (temporary memory); pareto (no other row is both faster and more
-        accurate); reason (why a row is NaN; empty if it is not).
+      rows: a list of dictionaries, ready for ``pandas.DataFrame(table.rows)``: method, dtype, dt (s; NaN for
+        adaptive runs), tolerance (NaN for fixed steps), num_steps, evaluations (of f), compile_seconds,
+        run_seconds (every repeat), run_seconds_min, run_seconds_median; error_final, error_max, error_l2
+        (Euclidean norm over the state; at t1, largest over the saved times, root mean square over them) and
+        each with _relative; gradient_error, gradient_error_relative, gradient_compile_seconds,
+        gradient_seconds, gradient_seconds_min, gradient_seconds_median, gradient_bytes (temporary memory);
+        pareto (no other row is both faster and more accurate); reason (why a row is NaN; empty if it is not).
       stability_limits: largest stable dt of each method at the initial state, s.
       reference_error: how far the reference itself may be trusted at t1; errors below say nothing.
       interval: (t0, t1), s.
@@ -87,7 +88,11 @@ class WorkPrecision:
     def series(self) -> Iterator[tuple[str, str, list[dict[str, Any]]]]:
         """(method, dtype, its fixed-step rows from coarse to fine)."""
         for method, dtype in dict.fromkeys((row["method"], row["dtype"]) for row in self.rows):
-            own = [r for r in self.rows if (r["method"], r["dtype"]) == (method, dtype) and math.isfinite(r["dt"])]
+            own = [
+                r
+                for r in self.rows
+                if (r["method"], r["dtype"]) == (method, dtype) and math.isfinite(r["dt"])
+            ]
             yield method, dtype, sorted(own, key=lambda row: -row["dt"])
 
     @property
@@ -111,13 +116,20 @@ class WorkPrecision:
             writer = csv.DictWriter(file, list(EMPTY_ROW))
             writer.writeheader()
             for row in self.rows:
-                writer.writerow({k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()})
+                writer.writerow(
+                    {k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()}
+                )
 
     def to_markdown(self) -> str:
-        """One line a method and dt (or tolerance); each precision has its columns. Bold: on the Pareto front."""
+        """One line a method and dt (or tolerance); each precision has its columns. Bold: on the Pareto
+        front."""
         dtypes = list(dict.fromkeys(row["dtype"] for row in self.rows))
         gradient = any(math.isfinite(row["gradient_error"]) for row in self.rows)
-        columns = ["relative error", "seconds", *(["gradient error", "gradient seconds", "MiB"] if gradient else [])]
+        columns = [
+            "relative error",
+            "seconds",
+            *(["gradient error", "gradient seconds", "MiB"] if gradient else []),
+        ]
         head = ["method", "dt, s", "steps", "evaluations"] + [f"{c}, {d}" for d in dtypes for c in columns]
         lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
         grid: dict[tuple, dict[str, dict[str, Any]]] = {}
@@ -129,9 +141,9 @@ class WorkPrecision:
             first = next(iter(by_dtype.values()))
             cells = [method, size, _count(first["num_steps"]), _count(first["evaluations"])]
             for dtype in dtypes:
-                row = by_dtype.get(dtype)
-                if row is None or row["reason"]:
-                    cells += ["-" if row is None else row["reason"], *[""] * (len(columns) - 1)]
+                row = by_dtype.get(dtype, {"reason": "-"})
+                if row["reason"]:
+                    cells += [row["reason"], *[""] * (len(columns) - 1)]
                     continue
                 error = f"{row['error_final_relative']:.1e}"
                 cells += [f"**{error}**" if row["pareto"] else error, f"{row['run_seconds_min']:.2e}"]
@@ -158,7 +170,8 @@ def _count(n: int) -> str:
 
 
 def mark_pareto(rows: list[dict[str, Any]]) -> None:
-    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no result."""
+    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no
+    result."""
     for row in rows:
         row["pareto"] = False
     best = math.inf
@@ -169,10 +182,11 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
 
 
 def roundoff_floor(dt: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """The error at which halving dt no longer takes a third off it, and that dt; NaN where that never happens.
+    """The error at which halving dt no longer takes a third off it, and that dt; NaN where that never
+    happens.
 
-    dt falls. The floor begins at the largest dt for which every dt of half its size or less has at least 2/3 of its
-    error.
+    dt falls. The floor begins at the largest dt for which every dt of half its size or less has at least 2/3
+    of its error.
     """
     for i in range(len(dt)):
         finer = error[dt <= dt[i] / 2 * (1 + 1e-6)]
@@ -186,7 +200,8 @@ def fitted_order(
 ) -> float:
     """Least-squares slope of log error over log dt from the finest four points that are above the floor.
 
-    Above the floor: dt > floor_dt and four times the floor; and not beyond 30 % relative error, where no power law holds.
+    Above the floor: dt > floor_dt and four times the floor; and not beyond 30 % relative error, where no
+    power law holds.
     """
     use = np.isfinite(error) & (error > 0) & ~(relative > 0.3)
     if math.isfinite(floor):

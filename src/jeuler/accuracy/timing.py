@@ -19,7 +19,8 @@ class Measurement:
       result: what it returned.
       compile_seconds: tracing, lowering and compiling it.
       run_seconds: each repeat, first run excluded, in the order measured; waits for the result.
-      temporary_bytes: peak memory beside inputs and outputs, as the compiler planned it; -1 if it does not say.
+      temporary_bytes: peak memory beside inputs and outputs, as the compiler planned it; -1 if it does not
+        say.
     """
 
     result: Any
@@ -41,8 +42,8 @@ def measure(
 ) -> Measurement:
     """Compile function for these inputs, run it once unmeasured, then ``repeats`` times measured.
 
-    Fewer times, but at least once, where they would take more than ``budget`` seconds together. A first run longer
-    than ``patience`` seconds is the only one, and is itself the measurement.
+    Fewer times, but at least once, where they would take more than ``budget`` seconds together. A first run
+    longer than ``patience`` seconds is the only one, and is itself the measurement.
     """
     begun = time.perf_counter()
     compiled = jax.jit(function).lower(*inputs).compile()
@@ -61,7 +62,8 @@ def measure(
 
 
 def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
-    """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and reset it."""
+    """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and
+    reset it."""
     count = 0
 
     def add_one(_: Any) -> None:
@@ -69,7 +71,9 @@ def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
         count += 1
 
     def counted(t, y, args):
-        jax.debug.callback(add_one, (t, jax.tree.leaves(y)))  # depends on all, so that vmap calls it once a member
+        jax.debug.callback(
+            add_one, (t, jax.tree.leaves(y))
+        )  # depends on all, so that vmap calls it once a member
         return f(t, y, args)
 
     def read() -> int:

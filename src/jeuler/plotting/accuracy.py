@@ -14,9 +14,9 @@ WORST = 3.0  # relative errors above this are off the figure
 def plot_work_precision(table: Any, ax: Any = None) -> Any:
     """Draw a `WorkPrecision` table: each method a line with its name beside it.
 
-    Left, relative error at t1 against the least seconds of a run, the Pareto front ringed, adaptive runs dotted; right,
-    against dt, with the roundoff floor as a level line where the sweep reached it and the largest stable dt as a
-    triangle. One such row of axes for each precision.
+    Left, relative error at t1 against the least seconds of a run, the Pareto front ringed, adaptive runs
+    dotted; right, against dt, with the roundoff floor as a level line where the sweep reached it and the
+    largest stable dt as a triangle. One such row of axes for each precision.
 
     Args:
       table: what `work_precision` returned.
@@ -32,7 +32,9 @@ def plot_work_precision(table: Any, ax: Any = None) -> Any:
         for pair, own_labels, dtype in zip(ax, labels, dtypes, strict=True):
             _finish(pair, own_labels)
             pair[0].set_title(f"{dtype}: rings mark runs that none beats in both time and error", fontsize=9)
-            pair[1].set_title(f"{dtype}: triangles, largest stable dt; dotted level, roundoff floor", fontsize=9)
+            pair[1].set_title(
+                f"{dtype}: triangles, largest stable dt; dotted level, roundoff floor", fontsize=9
+            )
     else:
         axes = ax if isinstance(ax, (tuple, list, np.ndarray)) else (ax,)
         _finish(axes, _draw(axes, table, dtypes))
@@ -52,7 +54,9 @@ def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list]:
                 _limits(axes[1], table, method, dtype, colours(index))
     front = [r for r in table.rows if r["pareto"] and r["dtype"] in dtypes and _drawable(r)]
     x, y = ([r[column] for r in front] for column in ("run_seconds_min", "error_final_relative"))
-    axes[0].loglog(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8)
+    axes[0].loglog(
+        x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8
+    )
     axes[0].set(xlabel="seconds for one run", ylabel="relative error at the end")
     if len(axes) == 2:
         axes[1].set(xlabel="dt, s")
@@ -72,7 +76,10 @@ def _lines(axes: Any, rows: list[dict], name: str, colour: Any, labels: list[lis
     """One method in one precision: its fixed steps as a line, its tolerances as a dotted one."""
     fixed = sorted((r for r in rows if math.isfinite(r["dt"])), key=lambda r: -r["dt"])
     adaptive = sorted((r for r in rows if math.isfinite(r["tolerance"])), key=lambda r: -r["tolerance"])
-    runs = [(0, fixed, "run_seconds_min", "-", name), (0, adaptive, "run_seconds_min", ":", f"{name}, adaptive")]
+    runs = [
+        (0, fixed, "run_seconds_min", "-", name),
+        (0, adaptive, "run_seconds_min", ":", f"{name}, adaptive"),
+    ]
     if len(axes) == 2:
         runs.append((1, fixed, "dt", "-", name))
     for place, own, column, style, label in runs:
@@ -97,18 +104,29 @@ def _limits(axes: Any, table: Any, method: str, dtype: str, colour: Any) -> None
             axes.hlines(level, min(dts), summary.floor_dt, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
         if 0 < summary.stability_limit < math.inf and min(dts) / 4 < summary.stability_limit < max(dts) * 4:
             where = axes.get_xaxis_transform()
-            axes.plot(summary.stability_limit, 0.985, "v", color=colour, markersize=6, transform=where, clip_on=False)
+            axes.plot(
+                summary.stability_limit,
+                0.985,
+                "v",
+                color=colour,
+                markersize=6,
+                transform=where,
+                clip_on=False,
+            )
 
 
 def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
-    """Write the labels in a column beside the axes, in the order of the points, each joined to its own by a thin line.
+    """Write the labels in a column beside the axes, in the order of the points, each joined to its own by a
+    thin line.
 
     labels: x, y (data), text, colour.
     """
     axes.figure.draw_without_rendering()
     low, high = axes.get_window_extent().y0, axes.get_window_extent().y1
     line = min(13 * axes.figure.dpi / 72, (high - low) / max(1, len(labels)))
-    ends = sorted(((axes.transData.transform((x, y))[1], x, y, text, colour) for x, y, text, colour in labels))
+    ends = sorted(
+        ((axes.transData.transform((x, y))[1], x, y, text, colour) for x, y, text, colour in labels)
+    )
     heights = [max(end[0], low + line * i) for i, end in enumerate(ends)]
     for i in range(1, len(heights)):
         heights[i] = max(heights[i], heights[i - 1] + line)
@@ -126,5 +144,12 @@ def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
             fontsize=8,
             va="center",
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": colour, "linewidth": 0.4, "alpha": 0.6, "shrinkA": 0, "relpos": (0, 0.5)},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": colour,
+                "linewidth": 0.4,
+                "alpha": 0.6,
+                "shrinkA": 0,
+                "relpos": (0, 0.5),
+            },
         )

@@ -37,8 +37,8 @@ def slope_field(
       f: scalar vector field, ``f(t, y, args) -> dy/dt``.
       t: first and last time, s.
       y: lowest and highest state shown.
-      solutions: curves to draw: exact ones as functions y(t), or initial values at t[0], which `rk4_step` carries on; or
-        a dictionary {label: curve}.
+      solutions: curves to draw: exact ones as functions y(t), or initial values at t[0], which `rk4_step`
+        carries on; or a dictionary {label: curve}.
       args: passed to f.
       dt: step of the curves carried on, s; None takes a thousandth of the interval.
       num: lines along each side.
@@ -49,7 +49,9 @@ def slope_field(
 
     ax = _axes(ax)
     times, states = np.meshgrid(np.linspace(*t, num), np.linspace(*y, num), indexing="ij")
-    slopes = np.asarray(jax.vmap(lambda t, y: f(t, y, args))(jnp.asarray(times.ravel()), jnp.asarray(states.ravel())))
+    slopes = np.asarray(
+        jax.vmap(lambda t, y: f(t, y, args))(jnp.asarray(times.ravel()), jnp.asarray(states.ravel()))
+    )
     aspect = (t[1] - t[0]) / (y[1] - y[0])  # lines of equal length on the page
     across = 1 / np.hypot(1, slopes.reshape(times.shape) * aspect)
     ax.quiver(
@@ -76,7 +78,15 @@ def slope_field(
             values = np.asarray(curve(x))
         else:
             size = dt or (t[1] - t[0]) / 1000
-            run = solve(f, float(curve), dt=size, num_steps=round((t[1] - t[0]) / size), t0=t[0], args=args, step=rk4_step)
+            run = solve(
+                f,
+                float(curve),
+                dt=size,
+                num_steps=round((t[1] - t[0]) / size),
+                t0=t[0],
+                args=args,
+                step=rk4_step,
+            )
             x, values = np.asarray(run.t), np.asarray(run.y)
         (line,) = ax.plot(x, values, color=f"C{index}")
         inside = np.flatnonzero((values >= y[0]) & (values <= y[1]))
@@ -102,7 +112,8 @@ def euler_polygon(
     """The polygon of the steps over the exact solution, with the slope at which each step leaves.
 
     Args:
-      f: scalar vector field. y0: initial value. t0, t1: first and last time, s. num_steps: corners after the first.
+      f: scalar vector field. y0: initial value. t0, t1: first and last time, s. num_steps: corners after the
+        first.
       exact: the exact solution, a function of t. args: passed to f. step: the method.
       ax: matplotlib axes; None makes a figure.
     Returns: the axes.
@@ -178,7 +189,10 @@ def local_and_cumulative_error(
     ax.semilogy(t[1:], cumulative[1:], "o-", color="C3", markersize=3)
     ax.semilogy(t[1:], local, "o-", color="C0", markersize=3)
     ax.set(xlabel="t", ylabel="error", title=f"dt = {dt:.3g}")
-    labels = [(t[-1], cumulative[-1], "cumulative: all steps so far", "C3"), (t[-1], local[-1], "local: one step", "C0")]
+    labels = [
+        (t[-1], cumulative[-1], "cumulative: all steps so far", "C3"),
+        (t[-1], local[-1], "local: one step", "C0"),
+    ]
     label_ends(ax, labels)
     return ax
 
@@ -248,7 +262,8 @@ def stability_regions(
     box: tuple[float, float, float, float] = (-4.5, 1.5, -3.5, 3.5),
     ax: Any = None,
 ) -> Any:
-    """Where |R(z)| <= 1 in the complex plane, z = dt lambda, and the eigenvalues of a problem times dt on top.
+    """Where |R(z)| <= 1 in the complex plane, z = dt lambda, and the eigenvalues of a problem times dt on
+    top.
 
     Args:
       steps: {name: step}, methods without separate treatment of position and velocity.
