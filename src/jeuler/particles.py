@@ -218,12 +218,12 @@ def simulate(
     state = _at_start(scene, state, grid.t0)
     motion = _check.state("state", (state.position, state.velocity))
     _check.same_form("the sum of forces", motion, jax.eval_shape(scene.vector_field, grid.t0, motion, state.mass))
-    prepared = scene.prepare(*motion[0].shape[:1], motion[0].dtype)
+    prepared = scene.prepare(len(motion[0]), motion[0].dtype)
     advance = advance_by(step, compensated=compensated)
 
     def field(t, motion, mass):  # on components, as they are carried from step to step
-        slope = prepared.vector_field(t, tuple(map(stack, motion)), mass)
-        return tuple(map(split, slope))
+        position, velocity = map(stack, motion)
+        return tuple(map(split, prepared.vector_field(t, (position, velocity), mass)))
 
     def next_state(n, t, state_and_lost):
         (motion, state), lost = state_and_lost
