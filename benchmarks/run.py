@@ -128,7 +128,7 @@ def figure(results: dict, path: pathlib.Path) -> None:
     columns = min(4, len(results))
     rows = -(-len(results) // columns)
     fig, axes = plt.subplots(
-        rows, columns, figsize=(3.6 * columns, 3.1 * rows), squeeze=False, layout="constrained"
+        rows, columns, figsize=(max(7, 3.6 * columns), 3.1 * rows + 0.4), squeeze=False, layout="constrained"
     )
     for ax in axes.ravel()[len(results) :]:
         ax.axis("off")
@@ -144,6 +144,7 @@ def figure(results: dict, path: pathlib.Path) -> None:
         )
         ax.invert_yaxis()
         ax.set_xscale("log")
+        ax.set_xlim(left=min(times.values()) / 3)
         ax.set_title(work, fontsize=9)
         ax.set_xlabel("ns per unit and step", fontsize=8)
     fig.suptitle("Forward (full) and reverse gradient (pale); shorter is better", fontsize=10)

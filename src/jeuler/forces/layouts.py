@@ -101,7 +101,8 @@ class Shifts(Layout):
 
 
 LONGEST_ROW = 32  # a particle with more edges has several rows, so that a hub does not pad all others
-GROUP_COST = 2000  # slots that one more group of rows costs in overhead
+GROUP_COST = 2000  # slots that one more group of rows costs in overhead,
+GROUP_SHARE = 1 / 60  # and at least this share of all, so that the program stays short
 
 
 class Rows(Layout):
@@ -232,16 +233,17 @@ def near_order(edges: np.ndarray, particles: int) -> np.ndarray:
 
 
 def group_widths(length: np.ndarray) -> np.ndarray:
-    """The row lengths to pad to: the set with the fewest slots, a group counting as GROUP_COST slots.
+    """The row lengths to pad to: the set with the fewest slots, a group counting as so many slots more.
 
     Dynamic programming over the lengths that occur: least[j] is the cost of the rows of the j shortest
     lengths.
     """
     lengths, counts = np.unique(length, return_counts=True)
     up_to = np.concatenate([[0], np.cumsum(counts)])
-    least, cut = [0], []
+    group_cost = max(GROUP_COST, GROUP_SHARE * length.sum())
+    least, cut = [0.0], []
     for j, width in enumerate(lengths):
-        costs = [least[i] + (up_to[j + 1] - up_to[i]) * int(width) + GROUP_COST for i in range(j + 1)]
+        costs = [least[i] + (up_to[j + 1] - up_to[i]) * int(width) + group_cost for i in range(j + 1)]
         cut.append(int(np.argmin(costs)))
         least.append(costs[cut[-1]])
     widths, j = [], len(lengths)
