@@ -1,7 +1,9 @@
-"""Each peer as ``peer(work) -> (forward, gradient)``: two functions without arguments, or None where it has none.
+"""Each peer as ``peer(work) -> (forward, gradient)``: two functions without arguments, or None where it has
+none.
 
-``forward()`` gives the positions at the end, (batch, particle, 3); ``gradient()`` the derivative of the sum of their
-squares with respect to initial position, velocity, ks and kd, in this order. All do explicit Euler in float32.
+``forward()`` gives the positions at the end, (batch, particle, 3); ``gradient()`` the derivative of the sum
+of their squares with respect to initial position, velocity, ks and kd, in this order. All do explicit Euler
+in float32.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ Pair = tuple[Callable | None, Callable | None]
 
 
 def _compiled(final: Callable, work: Work) -> Pair:
-    """Forward and gradient of ``final(position, velocity, ks, kd) -> position`` of one system, vmapped over a batch."""
+    """Forward and gradient of ``final(position, velocity, ks, kd) -> position`` of one system, vmapped over a
+    batch."""
     if work.batch > 1:
         run = jax.vmap(final, in_axes=(0, 0, None, None))
         start = work.position, work.velocity
@@ -34,7 +37,9 @@ def _compiled(final: Callable, work: Work) -> Pair:
         run, start = final, (work.position[0], work.velocity[0])
     args = (*map(jnp.asarray, start), jnp.float32(KS), jnp.float32(KD))
     forward = jax.jit(run).lower(*args).compile()
-    gradient = jax.jit(jax.grad(lambda *a: jnp.sum(run(*a) ** 2), argnums=(0, 1, 2, 3))).lower(*args).compile()
+    gradient = (
+        jax.jit(jax.grad(lambda *a: jnp.sum(run(*a) ** 2), argnums=(0, 1, 2, 3))).lower(*args).compile()
+    )
     return lambda: jax.block_until_ready(forward(*args)), lambda: jax.block_until_ready(gradient(*args))
 
 
@@ -93,8 +98,8 @@ def diffrax_euler(work: Work, adjoint=diffrax.RecursiveCheckpointAdjoint) -> Pai
 
     def final(position, velocity, ks, kd):
         solution = diffrax.diffeqsolve(
-            term, diffrax.Euler(), 0.0, work.steps * DT, DT, (position, velocity), args=(ks, kd), adjoint=adjoint(),
-            max_steps=work.steps + 1,
+            term, diffrax.Euler(), 0.0, work.steps * DT, DT, (position, velocity), args=(ks, kd),
+            adjoint=adjoint(), max_steps=work.steps + 1,
         )  # fmt: skip
         return solution.ys[0][0]
 
@@ -115,7 +120,11 @@ def jax_md(work: Work) -> Pair:
 
     def final(position, velocity, ks, kd):
         bonds = energy.simple_spring_bond(
-            displacement, jnp.asarray(whole.edges), length=jnp.asarray(whole.rest_length), epsilon=ks, alpha=2.0
+            displacement,
+            jnp.asarray(whole.edges),
+            length=jnp.asarray(whole.rest_length),
+            epsilon=ks,
+            alpha=2.0,
         )
         force = quantity.force(bonds)
 
@@ -130,7 +139,6 @@ def jax_md(work: Work) -> Pair:
 
 def warp(work: Work) -> Pair:
     import warp as wp
-
     import warp_kernels as kernels
 
     whole = work.flat()
@@ -201,7 +209,17 @@ def c_program(work: Work) -> Pair:
         x, v = whole.position[0].copy(), whole.velocity[0].copy()
         f = np.empty_like(x)
         numbers = map(ctypes.c_float, (KS, KD, DT, whole.gravity, whole.drag))
-        run(whole.steps, n, len(edges), address(edges), address(rest), *numbers, address(x), address(v), address(f))
+        run(
+            whole.steps,
+            n,
+            len(edges),
+            address(edges),
+            address(rest),
+            *numbers,
+            address(x),
+            address(v),
+            address(f),
+        )
         return x[None]
 
     return forward, None

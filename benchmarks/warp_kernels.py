@@ -1,4 +1,5 @@
-"""The kernels of the Warp peer: springs add to their ends atomically, Warp differentiates them on its tape."""
+"""The kernels of the Warp peer: springs add to their ends atomically, Warp differentiates them on its
+tape."""
 
 import warp as wp
 

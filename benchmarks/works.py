@@ -100,7 +100,14 @@ def free(count: int, steps: int) -> Work:
 
 def works(small: bool) -> list[Work]:
     """All of them; ``small`` leaves out what takes minutes."""
-    chosen = [cloth(16, 400), cloth(64, 100), mesh(1000, 400), mesh(100_000, 20), chains(1024, 16, 100), free(100_000, 30)]
+    chosen = [
+        cloth(16, 400),
+        cloth(64, 100),
+        mesh(1000, 400),
+        mesh(100_000, 20),
+        chains(1024, 16, 100),
+        free(100_000, 30),
+    ]
     if not small:
         chosen += [cloth(256, 10), cloth(512, 5), mesh(10_000, 100), mesh(1_000_000, 4)]
     return chosen

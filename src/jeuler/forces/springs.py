@@ -7,19 +7,21 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from jeuler import _tree
 from jeuler._components import split, stack
-from jeuler.forces.incidence import Layout
+from jeuler.forces.incidence import stored
+from jeuler.forces.layouts import Layout
 from jeuler.forces.topology import Topology
 
 
 def direction(d: Array) -> tuple[Array, Array]:
-    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r = 0.
+    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r =
+    0.
 
-    Ends closer than tiny^(1/3) (2e-13 in float32, 3e-103 in float64) count as coincident: below that, the second
-    derivative of r overflows.
+    Ends closer than tiny^(1/3) (2e-13 in float32, 3e-103 in float64) count as coincident: below that, the
+    second derivative of r overflows.
     """
     square = jnp.sum(d * d, axis=-1, keepdims=True)
     apart = square > jnp.finfo(d.dtype).tiny ** (2 / 3)
@@ -50,17 +52,16 @@ def spring_force(
 ) -> list[Array]:
     """The force on the first end of each spring, from d = p_i - p_j and v_i - v_j, one array a component.
 
-        F = c d,   c = (ks (L - r) - kd v.u) / r,   u = d / r
+        F = c d,   c = (ks L - kd v.u) / r - ks,   u = d / r
 
-    At r = 0, c is the number -ks with all its derivatives 0 (see `direction`), so that for L = 0 the Jacobian there is
-    -ks I. One number c a spring: it ends in a division, which the compiler does not do twice, so it is stored and the
-    components of F, at either end, are products with it.
+    At r = 0, c is the number -ks with all its derivatives 0 (see `direction`), so that for L = 0 the Jacobian
+    there is -ks I. One number c a spring, stored: the components of F, at either end, are products with it.
     """
     r = length(dot(d, d))
     apart = r > 0
     divisor = jnp.where(apart, r, 1)
     approach = dot(relative_velocity, d) / divisor
-    c = jnp.where(apart, ks * (rest_length - r) - kd * approach, -ks) / divisor
+    c = stored(jnp.where(apart, ks * rest_length - kd * approach, 0) / divisor - ks)
     return [c * component for component in d]
 
 
@@ -71,16 +72,19 @@ class Springs:
         d = p_i - p_j,  r = |d|,  u = d / r
         F_i = ks (L - r) u - kd ((v_i - v_j).u) u,   F_j = -F_i
 
-    At r = 0 the direction u is taken as 0: the force is finite, and with L = 0 it is 0 with derivative exactly -ks I.
+    At r = 0 the direction u is taken as 0: the force is finite, and with L = 0 it is 0 with derivative
+    exactly -ks I.
 
     Args:
-      edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May be empty.
+      edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May
+        be empty.
       ks: stiffness of each spring, shape () or (spring,), N/m. Differentiable.
       kd: damping of each spring, shape () or (spring,), N s/m. Differentiable.
       rest_length: L, length without force, shape () or (spring,), m. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
-    Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in `simulate`, if
-      an index is out of range or a parameter has another shape.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim),
+      N.
+    Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in
+      `simulate`, if an index is out of range or a parameter has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> spring = jeuler.Springs([[0, 1]], ks=10.0, kd=0.0, rest_length=1.0)
@@ -103,7 +107,8 @@ class Springs:
         return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
 
     def prepare(self, particles: int, dtype: Any) -> PreparedSprings:
-        """The same force with its parameters laid out for the kernels, which is the same work at every step."""
+        """The same force with its parameters laid out for the kernels, which is the same work at every
+        step."""
         layouts = self.edges.layouts(particles)
         parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
         return PreparedSprings(layouts, *([layout.to_slots(x) for layout in layouts] for x in parameters))
@@ -135,7 +140,8 @@ class Springs:
 
 @_tree.component(static=("layouts",))
 class PreparedSprings:
-    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and group."""
+    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and
+    group."""
 
     layouts: tuple[Layout, ...]
     ks: Any

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler.forces.incidence import Layout, Pairs, Rows, Shifts
+from jeuler.forces.layouts import Layout, Pairs, Rows, Shifts
 
 MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
 SHIFT_GAIN = 4  # how many slots of Shifts cost what one edge costs in Rows
@@ -21,7 +21,8 @@ class Topology:
     """The edges of a scene, fixed while tracing: hashable and equal by content, read as an integer array.
 
     The signed incidence operator B takes a value at each particle to its difference along each edge,
-    (B x)_e = x_i - x_j for e = (i, j). Its transpose sums what each edge gives to its two ends, +f at i and -f at j.
+    (B x)_e = x_i - x_j for e = (i, j). Its transpose sums what each edge gives to its two ends, +f at i and
+    -f at j.
     """
 
     def __init__(self, edges: Any) -> None:
@@ -79,9 +80,9 @@ class Topology:
     def layouts(self, particles: int) -> tuple[Layout, ...]:
         """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
 
-        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
-        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. Of
-        the others, if they are less than one in FEW particles, `Pairs`, else `Rows`.
+        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that
+        is if there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the
+        commonest first. Of the others, if they are less than one in FEW particles, `Pairs`, else `Rows`.
         """
         return _layouts(self, particles)
 
