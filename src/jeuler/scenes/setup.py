@@ -38,7 +38,12 @@ class Setup:
 
     def run(self, seed: int = 0, **changes: Any) -> Solution:
         """The solution; ``changes`` are arguments of `simulate` to take instead."""
-        arguments: dict[str, Any] = {"dt": self.dt, "num_steps": self.num_steps, "save_every": self.save_every, "step": self.step}
+        arguments: dict[str, Any] = {
+            "dt": self.dt,
+            "num_steps": self.num_steps,
+            "save_every": self.save_every,
+            "step": self.step,
+        }
         key = jax.random.key(seed)
         return jax.jit(lambda scene, state: simulate(scene, state, key=key, **(arguments | changes)))(
             self.scene, self.state
@@ -58,5 +63,9 @@ class Setup:
         solution = self.run() if solution is None else solution
         frame = self.frame if frame is None else frame
         state = jax.tree.map(lambda x: x[frame], solution.y)
-        look: dict[str, Any] = {"camera": Camera(**self.camera), "background": self.background, "t": float(solution.t[frame])}
+        look: dict[str, Any] = {
+            "camera": Camera(**self.camera),
+            "background": self.background,
+            "t": float(solution.t[frame]),
+        }
         save_picture(path, state, self.scene, **(look | options))
