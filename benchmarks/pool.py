@@ -83,7 +83,7 @@ def main() -> None:
             seconds[name].append(time.perf_counter() - start)
 
     print(
-        f"{platform.machine()}, {os.cpu_count()} CPUs, jax {jax.__version__}, float32, {STEPS} steps, {REPEATS} repeats\n"
+        f"{platform.machine()}, {os.cpu_count()} CPUs, jax {jax.__version__}, float32, {STEPS} steps, {REPEATS} runs\n"
     )
     print("| pool | particles used | alive at the end | missed | us a step | of 5,000 in use |")
     print("|---|---|---|---|---|---|")

@@ -214,6 +214,7 @@ class GifWriter(animation.PillowWriter):
         from PIL import Image
 
         super().grab_frame(**options)
+        self._frames: list[Any]
         frame = self._frames[-1].convert("RGB")
         self._frames[-1] = frame.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
@@ -227,6 +228,7 @@ def alive_of(state: ParticleState) -> np.ndarray:
 def new_axes(dim: int, background: Any, size: tuple = (6.0, 4.5)) -> Any:
     """Axes without a frame, that keep what is round round."""
     figure = plt.figure(figsize=size, facecolor=background)
+    ax: Any
     if dim == 3:  # axes in space are square: let the square cover the whole picture
         square = max(size) / np.array(size)
         ax = figure.add_axes((*(1 - square) / 2, *square), projection="3d")
@@ -310,7 +312,8 @@ class Picture:
     """The artists of one scene, made once and moved from frame to frame."""
 
     def __init__(self, ax: Any, scene: Any, view: View, frame: ParticleState, t: float) -> None:
-        self.ax, self.view, self.solids = ax, view, []
+        self.ax, self.view = ax, view
+        self.solids: list[Any] = []
         position = np.asarray(frame.position)
         self.dim = position.shape[1]
         view.aim(ax, position, alive_of(frame), t)

@@ -38,7 +38,12 @@ class Setup:
 
     def run(self, seed: int = 0, **changes: Any) -> Solution:
         """The solution; ``changes`` are arguments of `simulate` to take instead."""
-        arguments = {"dt": self.dt, "num_steps": self.num_steps, "save_every": self.save_every, "step": self.step}
+        arguments: dict[str, Any] = {
+            "dt": self.dt,
+            "num_steps": self.num_steps,
+            "save_every": self.save_every,
+            "step": self.step,
+        }
         key = jax.random.key(seed)
         return jax.jit(lambda scene, state: simulate(scene, state, key=key, **(arguments | changes)))(
             self.scene, self.state
@@ -48,7 +53,7 @@ class Setup:
         """The film of the run, written to the path (.gif, .mp4, .html) if there is one."""
         from jeuler.plotting.render import Camera, animate
 
-        look = {"camera": Camera(**self.camera), "background": self.background}
+        look: dict[str, Any] = {"camera": Camera(**self.camera), "background": self.background}
         return animate(self.run(), self.scene, path, **(look | options))
 
     def picture(self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any) -> None:
@@ -58,5 +63,9 @@ class Setup:
         solution = self.run() if solution is None else solution
         frame = self.frame if frame is None else frame
         state = jax.tree.map(lambda x: x[frame], solution.y)
-        look = {"camera": Camera(**self.camera), "background": self.background, "t": float(solution.t[frame])}
+        look: dict[str, Any] = {
+            "camera": Camera(**self.camera),
+            "background": self.background,
+            "t": float(solution.t[frame]),
+        }
         save_picture(path, state, self.scene, **(look | options))
