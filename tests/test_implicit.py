@@ -108,7 +108,8 @@ def test_reverse_mode_costs_one_linear_solve_a_step():
 
 def test_step_that_does_not_converge_is_named():
     """y = 1 + 100 dt exp(y) has no solution."""
-    growth = jeuler.solve(lambda t, y, k: k * jnp.exp(y), 1.0, dt=1e-3, num_steps=500, args=1.0, step=implicit_euler_step)
+    step = implicit_euler_step
+    growth = jeuler.solve(lambda t, y, k: k * jnp.exp(y), 1.0, dt=1e-3, num_steps=500, args=1.0, step=step)
     step = int(growth.first_nonfinite)
     assert 300 < step < 400  # y' = exp(y) from 1 ends at t = exp(-1) = 0.368
     assert jnp.isfinite(growth.y[step - 1])

@@ -192,7 +192,7 @@ def test_inside_of_a_sphere_holds():
 
 
 def test_moving_wall_hits_a_ball():
-    """A wall at 2 m/s meets a ball at rest at x = 1: elastic, the ball leaves with 4 m/s; it ends at 1 + 4 (T - 1/2)."""
+    """A wall at 2 m/s meets a resting ball at x = 1: elastic, it leaves with 4 m/s and ends at 1 + 4 (T - 1/2)."""
     wall = Plane(SampledPath([0.0, 10.0], [[0.0], [20.0]]), [1.0])
     scene = jeuler.Scene(effects=(Collisions((wall,), restitution=1.0),))
     run = jeuler.simulate(scene, ball([1.0], [0.0]), dt=0.3, num_steps=3).y
