@@ -126,8 +126,9 @@ def test_internal_forces_keep_momentum_to_roundoff(step, random):
 
 
 def test_energy_never_rises_in_a_damped_scene_under_implicit_euler(random):
+    """Five particles anywhere, every pair joined with rest length 0 (a convex energy); dt is 1000 times kd / ks."""
     edges = [[i, j] for i in range(5) for j in range(i)]
-    scene = jeuler.Scene((springs(1.0, ks=1e4, kd=1.0, edges=edges), jeuler.Gravity([0.0, -9.81])))
+    scene = jeuler.Scene((springs(0.0, ks=1e4, kd=1.0, edges=edges), jeuler.Gravity([0.0, -9.81])))
     start = jnp.asarray(random.normal(size=(20, 2, 5, 2)))
 
     @jax.vmap
@@ -137,12 +138,12 @@ def test_energy_never_rises_in_a_damped_scene_under_implicit_euler(random):
         def energy(t, state):
             return scene.energy(t, (state.position, state.velocity), state.mass)
 
-        return jeuler.simulate(scene, state, dt=0.02, num_steps=60, step=implicit_euler_step, save=energy)
+        return jeuler.simulate(scene, state, dt=0.1, num_steps=60, step=implicit_euler_step, save=energy)
 
     run = jax.jit(energies)(start)
     assert jnp.all(run.first_nonfinite == -1)
     rise = jnp.diff(run.y, axis=1) / run.y[:, :1]
-    assert jnp.max(rise) <= 1e-12
+    assert jnp.max(rise) <= 1e-9  # Newton's tolerance
 
 
 OSCILLATOR = jeuler.Scene((jeuler.Springs([[0, 1]], ks=1.0, kd=0.0, rest_length=0.0),))

@@ -47,7 +47,7 @@ class Diagnosis:
             return "every value and gradient that was looked at is finite"
         where = "" if self.step is None else f" in step {self.step}"
         who = "".join(
-            f", {name} {', '.join(map(str, some[:5]))}{' ...' if len(some) > 5 else ''}"
+            f", {name}{'s' * (len(some) > 1)} {', '.join(map(str, some[:5]))}{' ...' if len(some) > 5 else ''}"
             for name, some in (("particle", self.particles), ("spring", self.springs))
             if some
         )
@@ -86,7 +86,8 @@ def diagnose(
       >>> scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks=100.0, kd=1.0, rest_length=1.0),))
       >>> state = jeuler.ParticleState(jnp.array([[0.0], [1.1]]), jnp.zeros((2, 1)))
       >>> print(jeuler.diagnose(scene, state, dt=0.5, num_steps=1000))
-      the value is lost in step 9..., dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
+      the value is lost in step ...: dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
+
     Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3.
     """
     run = _Run(scene, state, float(dt), float(t0), step, key)

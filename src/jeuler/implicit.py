@@ -61,6 +61,7 @@ def implicit_euler(
       >>> step = jeuler.implicit_euler(max_steps=100)
       >>> round(float(step(lambda t, y, args: -1e6 * (y - t), 0.0, 1.0, 0.1, None)), 4)
       0.1
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8.
     """
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
@@ -114,6 +115,7 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
       >>> step = jeuler.linearly_implicit_euler()
       >>> float(step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None))
       0.5
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.9, eq. 9.25; D. Baraff,
       A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, eq. 6.
     """

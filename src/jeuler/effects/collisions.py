@@ -68,6 +68,7 @@ class Collisions:
       >>> end = jeuler.simulate(jeuler.Scene(effects=(elastic,)), balls, dt=0.25, num_steps=4)
       >>> [round(x, 5) for x in end.y.position[-1, :, 0].tolist()]
       [0.32, 1.2]
+
     Source: B. Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems, 1996, ch. 3; gradients: Y. Hu et al.,
       DiffTaichi, ICLR 2020, sect. 4 (time of impact).
     """
