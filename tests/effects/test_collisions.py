@@ -202,7 +202,7 @@ def test_moving_wall_hits_a_ball():
 
 def test_a_pinned_particle_is_a_wall_and_is_not_moved():
     balls = Collisions((FLOOR,), pairs=[(0, 1)], radius=0.1, restitution=1.0)
-    state = jeuler.ParticleState([[0.0, 0.05], [1.0, 0.05]], [[0.0, 0.0], [-1.0, 0.0]], mass=[jnp.inf, 1.0])
+    state = jeuler.ParticleState([[0.0, 0.1], [1.0, 0.1]], [[0.0, 0.0], [-1.0, 0.0]], mass=[jnp.inf, 1.0])
     run = jeuler.simulate(jeuler.Scene(effects=(balls,)), state, dt=0.5, num_steps=3).y
     np.testing.assert_array_equal(run.position[:, 0], run.position[:1, 0].repeat(4, 0))
     np.testing.assert_allclose(run.position[-1, 1, 0], 0.9, rtol=1e-12)

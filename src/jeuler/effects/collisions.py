@@ -217,16 +217,18 @@ class _Step:
             roundoff = self.roundoff(path.x)
             distance, rate = slope(start)
             touching = (distance <= roundoff) & (rate < 0)
+            inside = distance < -roundoff  # overlap from the start: no root to follow
             distance, rate = slope(s)
             meeting = (s <= 1) & (rate < 0) & (jnp.abs(distance) <= roundoff + 1e-6 * length(way))
-            return s, (touching, meeting)
+            return s, (touching, inside, meeting)
 
         def tangent_solve(matvec, b):
             rate = matvec(jnp.ones_like(b))
             return jnp.where(rate < 0, b / jnp.where(rate < 0, rate, -1), 0)
 
-        s, (touching, meeting) = root(gap, path.s, solve, tangent_solve)
-        s = jnp.where(touching, path.s, jnp.where(meeting, s, jnp.inf))
+        s, (touching, inside, meeting) = root(gap, path.s, solve, tangent_solve)
+        at_once = jnp.where(inside, path.s, lax.stop_gradient(path.s - s) + s)  # the value path.s, the slope of the root
+        s = jnp.where(touching, at_once, jnp.where(meeting, s, jnp.inf))
         return jnp.where(self.inverse_mass > 0, s, jnp.inf)
 
     def time_of_meeting(self, path: Path) -> Array:
