@@ -298,7 +298,9 @@ class _Step:
             stop, left = self.bounce(v, normal, recession, 0)
             slide = x - path.x
             slide = slide - jnp.sum(slide * normal, axis=-1, keepdims=True) * normal
-            touching = (((gap < 0) | on_it) & (self.inverse_mass > 0))[:, None]
+            under = gap < -self.roundoff(x)  # a bounce that ends with the step is on the surface, and leaves it
+            staying = on_it & (jnp.sum(v * normal, axis=-1) + recession <= 0)
+            touching = ((under | staying) & (self.inverse_mass > 0))[:, None]
             x = x - jnp.where(touching, gap[:, None] * normal + (1 - left)[:, None] * slide, 0)
             v = v + jnp.where(touching, stop, 0)
         return x, v
