@@ -227,7 +227,7 @@ class _Step:
             return jnp.where(rate < 0, b / jnp.where(rate < 0, rate, -1), 0)
 
         s, (touching, inside, meeting) = root(gap, path.s, solve, tangent_solve)
-        at_once = jnp.where(inside, path.s, lax.stop_gradient(path.s - s) + s)  # the value path.s, the slope of the root
+        at_once = jnp.where(inside, path.s, lax.stop_gradient(path.s - s) + s)  # value path.s, slope of the root
         s = jnp.where(touching, at_once, jnp.where(meeting, s, jnp.inf))
         return jnp.where(self.inverse_mass > 0, s, jnp.inf)
 
