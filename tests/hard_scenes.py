@@ -21,12 +21,12 @@ def cloth_springs(n):
     return np.concatenate(edges), np.concatenate(lengths)
 
 
-def cloth(n, dtype=jnp.float64):
-    """A cloth of 0.2 kg held at two corners, at rest length in its plane but blown into motion with 1 m/s."""
+def cloth(n, dtype=jnp.float64, speed=0.1):
+    """A cloth of 0.2 kg held at two corners, flat at rest length, its velocity a waving field of this speed, m/s."""
     grid = np.stack(np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij"), axis=-1).reshape(-1, 2)
     position = np.column_stack([grid, np.zeros(n * n)])
     x, y = grid.T
-    velocity = np.column_stack([np.sin(7 * y), np.cos(5 * x), np.sin(9 * x + 4 * y)])
+    velocity = speed * np.column_stack([np.sin(7 * y), np.cos(5 * x), np.sin(9 * x + 4 * y)])
     mass = np.full(n * n, 0.2 / n**2)
     mass[[0, n - 1]] = np.inf
     return jeuler.ParticleState(*(jnp.asarray(x, dtype) for x in (position, velocity, mass)))
@@ -34,4 +34,5 @@ def cloth(n, dtype=jnp.float64):
 
 def cloth_scene(n, ks, kd):
     edges, lengths = cloth_springs(n)
-    return jeuler.Scene(forces=(jeuler.Springs(edges, ks=ks, kd=kd, rest_length=lengths),))
+    springs = jeuler.Springs(edges, ks=ks, kd=kd, rest_length=lengths)
+    return jeuler.Scene(forces=(jeuler.Gravity([0.0, 0.0, -9.81]), springs))

@@ -110,10 +110,8 @@ ad.primitive_jvps[root_p] = _jvp
 def _batch(operands, axes, *, programs, sizes):
     size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
     guess, *consts = operands
-    if axes[0] is None:
-        guess = jnp.broadcast_to(guess, (size, *guess.shape))
-    else:
-        guess = jnp.moveaxis(guess, axes[0], 0)
+    axis = axes[0]
+    guess = jnp.broadcast_to(guess, (size, *guess.shape)) if axis is None else jnp.moveaxis(guess, axis, 0)
 
     def batched(program, consts, axes, *x):
         function = jax.vmap(jaxpr_as_fun(program), in_axes=(*axes, *(0 for _ in x)))

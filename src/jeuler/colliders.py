@@ -78,6 +78,7 @@ class Plane(_Shape):
       >>> import jax.numpy as jnp, jeuler
       >>> float(jeuler.Plane(point=[0.0, 1.0], normal=[0.0, 2.0])(0.0, jnp.array([5.0, 4.0])))
       3.0
+
     Source: C. Ericson, Real-Time Collision Detection, 2005, sect. 5.1.1.
     """
 
@@ -104,6 +105,7 @@ class Sphere(_Shape):
       >>> import jax.numpy as jnp, jeuler
       >>> float(jeuler.Sphere(center=[0.0, 0.0], radius=1.0)(0.0, jnp.array([3.0, 4.0])))
       4.0
+
     Source: C. Ericson, Real-Time Collision Detection, 2005, sect. 5.2.
     """
 
@@ -131,6 +133,7 @@ class Box(_Shape):
       >>> import jax.numpy as jnp, jeuler
       >>> float(jeuler.Box(center=[0.0, 0.0], half_size=[1.0, 2.0])(0.0, jnp.array([4.0, 6.0])))
       5.0
+
     Source: I. Quilez, Distance functions, iquilezles.org, 2008 (box, exact).
     """
 

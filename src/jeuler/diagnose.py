@@ -47,7 +47,7 @@ class Diagnosis:
             return "every value and gradient that was looked at is finite"
         where = "" if self.step is None else f" in step {self.step}"
         who = "".join(
-            f", {name} {', '.join(map(str, some[:5]))}{' ...' if len(some) > 5 else ''}"
+            f", {name}{'s' * (len(some) > 1)} {', '.join(map(str, some[:5]))}{' ...' if len(some) > 5 else ''}"
             for name, some in (("particle", self.particles), ("spring", self.springs))
             if some
         )
@@ -86,8 +86,9 @@ def diagnose(
       >>> scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks=100.0, kd=1.0, rest_length=1.0),))
       >>> state = jeuler.ParticleState(jnp.array([[0.0], [1.1]]), jnp.zeros((2, 1)))
       >>> print(jeuler.diagnose(scene, state, dt=0.5, num_steps=1000))
-      the value is lost in step 9..., dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
-    Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3 (stiffness and step size).
+      the value is lost in step ...: dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
+
+    Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3.
     """
     run = _Run(scene, state, float(dt), float(t0), step, key)
     return run.lost_value(num_steps) or (run.lost_gradient(num_steps, loss) if loss else None) or Diagnosis(True)
@@ -119,7 +120,7 @@ class _Run:
         dtype = before.position.dtype
         dt, t = jnp.asarray(self.dt, dtype), jnp.asarray(self.t0 + (n - 1) * self.dt, dtype)
         x, v = self.step(scene.vector_field, t, (before.position, before.velocity), dt, before.mass)
-        state = dataclasses.replace(before, position=x, velocity=v)
+        state: Any = dataclasses.replace(before, position=x, velocity=v)  # type: ignore[type-var]
         yield _name(self.step), state
         for k, effect in enumerate(scene.effects):
             own_key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n - 1), k)
@@ -151,7 +152,8 @@ class _Run:
         for k, force in enumerate(self.scene.forces):
             bad = _particles(force(t, x, v, mass))
             if bad:
-                return self.explain("value", n, f"forces[{k}] {_name(force)}", bad, before, _springs(force, before, bad))
+                part = f"forces[{k}] {_name(force)}"
+                return self.explain("value", n, part, bad, before, _springs(force, before, bad))
         bad = _particles(self.scene.vector_field(t, (x, v), mass)[1])
         if bad and float(jnp.max(jnp.abs(x))) < self.huge():
             light = np.broadcast_to(mass, len(x))[bad[0]]
@@ -186,7 +188,7 @@ class _Run:
         """Follow the cotangent of the loss back, step by step, to the first that is not finite."""
         states = self.solution(num_steps, save_every=1).y
 
-        def after(n, scene, motion, before):
+        def after(scene, motion, n, before):
             before = dataclasses.replace(before, position=motion[0], velocity=motion[1])
             *_, (_, state) = self.parts_of_step(scene, n, before)
             return state.position, state.velocity
@@ -194,7 +196,7 @@ class _Run:
         @jax.jit
         def pull_back(n, before, cotangent):
             motion = before.position, before.velocity
-            _, pullback = jax.vjp(lambda *free: after(n, *free, before), self.scene, motion)
+            _, pullback = jax.vjp(lambda scene, motion: after(scene, motion, n, before), self.scene, motion)
             return pullback(cotangent)
 
         last = jax.tree.map(lambda x: x[-1], states)
@@ -243,7 +245,7 @@ class _Run:
     def explain(
         self, quantity: str, n: int, part: str, bad: tuple[int, ...], before: ParticleState, springs: Any = ()
     ) -> Diagnosis:
-        """A part that gave a number that is not finite from finite ones: too large a step, too large numbers, itself."""
+        """Why a part gave what is not finite from finite numbers: the step size, their size, or itself."""
         reached, dtype = _largest((before.position, before.velocity)), before.position.dtype
         grown = reached > 1e3 * max(1.0, _largest((self.state.position, self.state.velocity)))
         limit = self.limit() if grown else np.inf

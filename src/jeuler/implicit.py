@@ -61,6 +61,7 @@ def implicit_euler(
       >>> step = jeuler.implicit_euler(max_steps=100)
       >>> round(float(step(lambda t, y, args: -1e6 * (y - t), 0.0, 1.0, 0.1, None)), 4)
       0.1
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8.
     """
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
@@ -114,6 +115,7 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
       >>> step = jeuler.linearly_implicit_euler()
       >>> float(step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None))
       0.5
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.9, eq. 9.25; D. Baraff,
       A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, eq. 6.
     """
@@ -162,7 +164,7 @@ def _system(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, velocity_deci
     unknown = state = lambda z: z
     roundoff = _largest(y)
     if _velocity_decides(f, t, y, args) if velocity_decides is None else velocity_decides:
-        (position, _), pair = jax.tree.flatten(y, is_leaf=lambda part: part is not y)
+        (position, _), pair = _parts(y)
         roundoff = jnp.maximum(_largest(y), _largest(position) / dt)
 
         def unknown(z):
@@ -182,9 +184,14 @@ def _system(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, velocity_deci
     return System(start, residual, lambda vector: state(from_vector(vector)), floor)
 
 
+def _parts(y: PyTree) -> tuple[list[PyTree], Any]:
+    """The outermost parts of a pytree, and how to put them together."""
+    return jax.tree.flatten(y, is_leaf=lambda part: part is not y)
+
+
 def _velocity_decides(f: VectorField, t: Any, y: PyTree, args: Any) -> bool:
     """Whether y is a pair (position, velocity) and the traced slope of position makes no use of position."""
-    parts, pair = jax.tree.flatten(y, is_leaf=lambda part: part is not y)
+    parts, pair = _parts(y)
     if len(parts) != 2:
         return False
     jaxpr = jax.make_jaxpr(lambda position: f(t, pair.unflatten((position, parts[1])), args))(parts[0]).jaxpr
@@ -201,7 +208,8 @@ def _velocity_decides(f: VectorField, t: Any, y: PyTree, args: Any) -> bool:
 
 def _real_vector(y: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
     """y as one real vector, and the way back; a complex leaf is its real and its imaginary part."""
-    leaves, tree = jax.tree.flatten(y)
+    leaves, structure = jax.tree.flatten(y)
+    tree: Any = structure
     is_complex = [jnp.iscomplexobj(leaf) for leaf in leaves]
     parts = [(leaf.real, leaf.imag) if c else leaf for leaf, c in zip(leaves, is_complex, strict=True)]
     vector, unravel = ravel_pytree(parts)
@@ -241,11 +249,11 @@ def _newton(rtol: float, max_steps: int, linear_solver: Any) -> Callable:
 
     def solve(residual, guess):
         solver = _newton_class()(rtol=rtol, atol=1.0, linear_solver=linear_solver)
-        solution = optimistix.root_find(
+        solution: Any = optimistix.root_find(
             lambda z, args: residual(z), solver, guess, max_steps=max_steps, throw=False
         )
         converged = solution.result == optimistix.RESULTS.successful
-        return solution.value, StepInfo(converged, solution.stats["num_steps"].astype(jnp.int32))
+        return solution.value, StepInfo(jnp.asarray(converged), solution.stats["num_steps"].astype(jnp.int32))
 
     return solve
 

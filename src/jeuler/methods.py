@@ -219,6 +219,7 @@ def cap_cotangent(step: Step, max_norm: float) -> Step:
       >>> capped = jeuler.cap_cotangent(jeuler.euler_step, 2.0)
       >>> float(jax.grad(lambda y: 100 * capped(lambda t, y, args: y, 0.0, y, 1.0, None))(3.0))
       2.0
+
     Source: R. Pascanu, T. Mikolov, Y. Bengio, On the difficulty of training recurrent neural networks, ICML 2013,
       sect. 3.2.
     """

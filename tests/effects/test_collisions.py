@@ -192,7 +192,7 @@ def test_inside_of_a_sphere_holds():
 
 
 def test_moving_wall_hits_a_ball():
-    """A wall at 2 m/s meets a ball at rest at x = 1: elastic, the ball leaves with 4 m/s; it ends at 1 + 4 (T - 1/2)."""
+    """A wall at 2 m/s meets a resting ball at x = 1: elastic, it leaves with 4 m/s and ends at 1 + 4 (T - 1/2)."""
     wall = Plane(SampledPath([0.0, 10.0], [[0.0], [20.0]]), [1.0])
     scene = jeuler.Scene(effects=(Collisions((wall,), restitution=1.0),))
     run = jeuler.simulate(scene, ball([1.0], [0.0]), dt=0.3, num_steps=3).y
@@ -202,7 +202,7 @@ def test_moving_wall_hits_a_ball():
 
 def test_a_pinned_particle_is_a_wall_and_is_not_moved():
     balls = Collisions((FLOOR,), pairs=[(0, 1)], radius=0.1, restitution=1.0)
-    state = jeuler.ParticleState([[0.0, 0.05], [1.0, 0.05]], [[0.0, 0.0], [-1.0, 0.0]], mass=[jnp.inf, 1.0])
+    state = jeuler.ParticleState([[0.0, 0.1], [1.0, 0.1]], [[0.0, 0.0], [-1.0, 0.0]], mass=[jnp.inf, 1.0])
     run = jeuler.simulate(jeuler.Scene(effects=(balls,)), state, dt=0.5, num_steps=3).y
     np.testing.assert_array_equal(run.position[:, 0], run.position[:1, 0].repeat(4, 0))
     np.testing.assert_allclose(run.position[-1, 1, 0], 0.9, rtol=1e-12)

@@ -35,5 +35,5 @@ def test_ball_settles_where_the_spring_carries_its_weight():
 
 def test_bad_shape():
     scene = jeuler.Scene((PenaltyContact(Plane([0.0], [1.0]), ks=[1.0, 2.0]),))
-    with pytest.raises(ValueError, match="PenaltyContact.ks must have shape"):
+    with pytest.raises(ValueError, match=r"PenaltyContact\.ks must have shape"):
         jeuler.simulate(scene, jeuler.ParticleState([[0.1]], [[0.0]]), dt=0.1, num_steps=1)

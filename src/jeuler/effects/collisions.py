@@ -68,6 +68,7 @@ class Collisions:
       >>> end = jeuler.simulate(jeuler.Scene(effects=(elastic,)), balls, dt=0.25, num_steps=4)
       >>> [round(x, 5) for x in end.y.position[-1, :, 0].tolist()]
       [0.32, 1.2]
+
     Source: B. Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems, 1996, ch. 3; gradients: Y. Hu et al.,
       DiffTaichi, ICLR 2020, sect. 4 (time of impact).
     """
@@ -216,16 +217,18 @@ class _Step:
             roundoff = self.roundoff(path.x)
             distance, rate = slope(start)
             touching = (distance <= roundoff) & (rate < 0)
+            inside = distance < -roundoff  # overlap from the start: no root to follow
             distance, rate = slope(s)
             meeting = (s <= 1) & (rate < 0) & (jnp.abs(distance) <= roundoff + 1e-6 * length(way))
-            return s, (touching, meeting)
+            return s, (touching, inside, meeting)
 
         def tangent_solve(matvec, b):
             rate = matvec(jnp.ones_like(b))
             return jnp.where(rate < 0, b / jnp.where(rate < 0, rate, -1), 0)
 
-        s, (touching, meeting) = root(gap, path.s, solve, tangent_solve)
-        s = jnp.where(touching, path.s, jnp.where(meeting, s, jnp.inf))
+        s, (touching, inside, meeting) = root(gap, path.s, solve, tangent_solve)
+        at_once = jnp.where(inside, path.s, lax.stop_gradient(path.s - s) + s)  # value path.s, slope of the root
+        s = jnp.where(touching, at_once, jnp.where(meeting, s, jnp.inf))
         return jnp.where(self.inverse_mass > 0, s, jnp.inf)
 
     def time_of_meeting(self, path: Path) -> Array:
@@ -295,7 +298,9 @@ class _Step:
             stop, left = self.bounce(v, normal, recession, 0)
             slide = x - path.x
             slide = slide - jnp.sum(slide * normal, axis=-1, keepdims=True) * normal
-            touching = (((gap < 0) | on_it) & (self.inverse_mass > 0))[:, None]
+            under = gap < -self.roundoff(x)  # a bounce that ends with the step is on the surface, and leaves it
+            staying = on_it & (jnp.sum(v * normal, axis=-1) + recession <= 0)
+            touching = ((under | staying) & (self.inverse_mass > 0))[:, None]
             x = x - jnp.where(touching, gap[:, None] * normal + (1 - left)[:, None] * slide, 0)
             v = v + jnp.where(touching, stop, 0)
         return x, v

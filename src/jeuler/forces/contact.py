@@ -33,6 +33,7 @@ class PenaltyContact:
       >>> floor = jeuler.PenaltyContact(jeuler.Plane([0.0, 0.0], [0.0, 1.0]), ks=100.0)
       >>> floor(0.0, jnp.array([[3.0, -0.5]]), jnp.zeros((1, 2)), jnp.asarray(1.0)).tolist()
       [[0.0, 50.0]]
+
     Source: M. Moore, J. Wilhelms, Collision Detection and Response for Computer Animation, SIGGRAPH 1988, sect. 3.1.
     """
 
