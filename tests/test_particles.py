@@ -189,21 +189,28 @@ def test_saved_state_has_one_leading_axis_everywhere():
 
 
 def test_effects_run_in_the_order_written_with_their_own_keys():
-    seen = []
 
     def shift(t, dt, state, key):
-        seen.append(jax.random.key_data(key))
         return dataclasses.replace(state, position=state.position + 1)
 
     def double(t, dt, state, key):
-        seen.append(jax.random.key_data(key))
         return dataclasses.replace(state, position=2 * state.position)
 
+    def draw(t, dt, state, key):
+        return dataclasses.replace(state, velocity=jax.random.normal(key, state.velocity.shape))
+
     state = jeuler.ParticleState(jnp.zeros((1, 1)), jnp.zeros((1, 1)))
-    with jax.disable_jit():
-        run = jeuler.simulate(jeuler.Scene(effects=(shift, double)), state, dt=0.1, num_steps=3, key=jax.random.key(3))
+    run = jeuler.simulate(jeuler.Scene(effects=(shift, double)), state, dt=0.1, num_steps=3)
     assert run.y.position[:, 0, 0].tolist() == [0, 2, 6, 14]
-    assert len({tuple(np.asarray(key).tolist()) for key in seen}) == 6
+
+    def drawn(effects, key=3):
+        return jeuler.simulate(jeuler.Scene(effects=effects), state, dt=0.1, num_steps=3, key=jax.random.key(key)).y.velocity
+
+    once, twice = drawn((draw,)), drawn((draw, draw))
+    assert len(np.unique(once)) == 4  # the start, and another number at each step
+    assert not np.isin(twice[1:], once[1:]).any()  # the second effect has a key of its own
+    np.testing.assert_array_equal(once, drawn((draw,)))
+    assert (once[1:] != drawn((draw,), key=4)[1:]).all()
 
 
 def test_effect_time_is_the_time_reached():

@@ -1,34 +1,135 @@
 """jeuler: differentiable Euler integration of springs, particles and ODEs in JAX."""
 
-from jeuler.effects import PrescribedMotion, SampledPath
+from jeuler.accuracy import Compensated, StepAdvice, WorkPrecision, advise_step, work_precision
+from jeuler.colliders import Box, Plane, Sphere
+from jeuler.declare import uses
+from jeuler.diagnose import Diagnosis, diagnose
+from jeuler.effects import (
+    Choice,
+    Collisions,
+    Cone,
+    Death,
+    DeathOnContact,
+    DeathOutside,
+    Emitter,
+    FromDisc,
+    FromLine,
+    FromSphere,
+    FromSurface,
+    Lifetime,
+    Normal,
+    OverLife,
+    PrescribedMotion,
+    SampledPath,
+    SpeedLimit,
+    Uniform,
+)
+from jeuler.extrapolation import AdaptiveSolution, extrapolated_euler, solve_adaptive
 from jeuler.fitting import Fit, SpringFit, fit, fit_springs
-from jeuler.forces import Gravity, QuadraticDrag, Springs
-from jeuler.methods import euler_step, heun_step, rk4_step, symplectic_euler_step
-from jeuler.particles import ParticleState, Scene, simulate
+from jeuler.forces import (
+    Bending,
+    Gravity,
+    Gust,
+    LinearDrag,
+    PenaltyContact,
+    PointAttractor,
+    QuadraticDrag,
+    ShapeMatching,
+    Springs,
+    StrandBending,
+    StrandCore,
+    Turbulence,
+    Viscosity,
+    Vortex,
+    Wind,
+    strand_edges,
+    turbulence,
+)
+from jeuler.implicit import (
+    implicit_euler,
+    implicit_euler_step,
+    linearly_implicit_euler,
+    linearly_implicit_euler_step,
+)
+from jeuler.methods import cap_cotangent, euler_step, heun_step, rk4_step, symplectic_euler_step
+from jeuler.particles import Scene, simulate
 from jeuler.solve import Solution, solve
+from jeuler.stability import stability_limit
+from jeuler.state import ParticleState, empty_pool
 from jeuler.trajectory import Trajectory, read_trajectory
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "AdaptiveSolution",
+    "Bending",
+    "Box",
+    "Choice",
+    "Collisions",
+    "Compensated",
+    "Cone",
+    "Death",
+    "DeathOnContact",
+    "DeathOutside",
+    "Diagnosis",
+    "Emitter",
     "Fit",
+    "FromDisc",
+    "FromLine",
+    "FromSphere",
+    "FromSurface",
     "Gravity",
+    "Gust",
+    "Lifetime",
+    "LinearDrag",
+    "Normal",
+    "OverLife",
     "ParticleState",
+    "PenaltyContact",
+    "Plane",
+    "PointAttractor",
     "PrescribedMotion",
     "QuadraticDrag",
     "SampledPath",
     "Scene",
+    "ShapeMatching",
     "Solution",
+    "SpeedLimit",
+    "Sphere",
     "SpringFit",
     "Springs",
+    "StepAdvice",
+    "StrandBending",
+    "StrandCore",
     "Trajectory",
+    "Turbulence",
+    "Uniform",
+    "Viscosity",
+    "Vortex",
+    "Wind",
+    "WorkPrecision",
+    "advise_step",
+    "cap_cotangent",
+    "diagnose",
+    "empty_pool",
     "euler_step",
+    "extrapolated_euler",
     "fit",
     "fit_springs",
     "heun_step",
+    "implicit_euler",
+    "implicit_euler_step",
+    "linearly_implicit_euler",
+    "linearly_implicit_euler_step",
     "read_trajectory",
     "rk4_step",
     "simulate",
     "solve",
+    "solve_adaptive",
+    "stability_limit",
+    "strand_edges",
     "symplectic_euler_step",
+    "turbulence",
+    "uses",
+    "work_precision",
 ]

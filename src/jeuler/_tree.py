@@ -82,11 +82,6 @@ def replace(component: T, **changes: Any) -> T:
     return dataclasses.replace(component, **changes)  # type: ignore[type-var]
 
 
-def replace(component: T, **changes: Any) -> T:
-    """The component with some fields changed; ``dataclasses.replace``, as type checkers understand it."""
-    return dataclasses.replace(component, **changes)  # type: ignore[type-var]
-
-
 def as_component(x: Any) -> Any:
     """x if it is a pytree of arrays already; a plain function is wrapped, so that no leaf is a function."""
     return Function(x) if callable(x) and jax.tree_util.all_leaves([x]) else x
