@@ -49,7 +49,8 @@ def main(path, part=""):
     ratios = np.array(ratios)
     near, above = np.mean((ratios >= 1 / 3) & (ratios <= 3)), np.mean(ratios <= 3)
     print(
-        f"{ratios.size} checked: {near:.0%} within a factor 3, {above:.0%} at most 3 times the target, worst {ratios.max():.2g}"
+        f"{ratios.size} checked: {near:.0%} within a factor 3, {above:.0%} at most 3 times the target, "
+        f"worst {ratios.max():.2g}"
     )
     print(f"{refused} refused, {unchecked} too long to check")
 

@@ -263,7 +263,7 @@ def _report(
         ],
         "rms": rms,
         "amplitude": amplitude,
-        "share_of_amplitude": rms / amplitude if amplitude else None,
+        "share_of_amplitude": rms / amplitude if amplitude else 0.0,
         "dt": float(dt),
         "iterations": len(found.history),
         "converged": bool(found.converged),
@@ -336,8 +336,8 @@ def _print(report: dict[str, Any], picture: str, example: bool) -> None:
         hertz, squared = omega / (2 * np.pi), omega**2
         print(f"  {'natural frequency':<24} {omega:.5g} rad/s = {hertz:.4g} Hz (squared {squared:.4g} 1/s^2)")
         print(f"  {'damping ratio':<24} {mode['damping_ratio']:.4g}")
-    share = f", {100 * report['share_of_amplitude']:.2g} % of the amplitude {report['amplitude']:.3g} m" if report["amplitude"] else ""
-    print(f"  {'residual RMS':<24} {report['rms']:.3g} m{share}")
+    share = f"{100 * report['share_of_amplitude']:.2g} % of the amplitude {report['amplitude']:.3g} m"
+    print(f"  {'residual RMS':<24} {report['rms']:.3g} m, {share}")
     print(f"  {'fit':<24} {report['message']}, {report['iterations']} iterations")
     print(f"  {'time':<24} {report['seconds']:.1f} s in all")
     print(f"  {'picture':<24} {picture}")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler import _tree
+from jeuler.declare import completed, declared
 from jeuler.forces import Springs
 from jeuler.methods import Step, euler_step
 from jeuler.particles import ParticleState, Scene, simulate
@@ -90,6 +91,7 @@ def diagnose(
 
     Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3.
     """
+    state = completed(state, scene.forces, scene.effects)
     run = _Run(scene, state, float(dt), float(t0), step, key)
     return run.lost_value(num_steps) or (run.lost_gradient(num_steps, loss) if loss else None) or Diagnosis(True)
 
@@ -119,22 +121,32 @@ class _Run:
         """The state after the step function and after each effect of step n, with the name of what was applied."""
         dtype = before.position.dtype
         dt, t = jnp.asarray(self.dt, dtype), jnp.asarray(self.t0 + (n - 1) * self.dt, dtype)
-        x, v = self.step(scene.vector_field, t, (before.position, before.velocity), dt, before.mass)
-        state: Any = dataclasses.replace(before, position=x, velocity=v)  # type: ignore[type-var]
-        yield _name(self.step), state
-        for k, effect in enumerate(scene.effects):
-            own_key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n - 1), k)
-            if hasattr(effect, "over_step"):
-                state = effect.over_step(t + dt, dt, before, state, own_key)
-            else:
-                state = effect(t + dt, dt, state, own_key)
-            yield f"effects[{k}] {_name(effect)}", state
+
+        def effects(now: Any, before: ParticleState, state: ParticleState, early: bool) -> Iterator:
+            for k, effect in enumerate(scene.effects):
+                if declared(effect, "before_motion", False) == early:
+                    own_key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n - 1), k)
+                    if hasattr(effect, "over_step"):
+                        state = effect.over_step(now, dt, before, state, own_key)
+                    else:
+                        state = effect(now, dt, state, own_key)
+                    yield f"effects[{k}] {_name(effect)}", state
+
+        for part, state in effects(t, before, before, early=True):
+            yield part, state
+            before = state
+        motion = before.position, before.velocity
+        x, v = self.step(scene.vector_field, t, motion, dt, scene.attributes(before))
+        moved = _tree.replace(before, position=x, velocity=v)
+        yield _name(self.step), moved
+        yield from effects(t + dt, before, moved, early=False)
 
     def lost_value(self, num_steps: int) -> Diagnosis | None:
         for name, tree in (("state", self.state), ("scene", self.scene)):
             for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
                 field = name + jax.tree_util.keystr(path)
-                bad = np.isnan(leaf) if field == "state.mass" else ~np.isfinite(leaf)
+                may_be_inf = field in ("state.mass", "state.lifetime")
+                bad = np.isnan(leaf) if may_be_inf else ~np.isfinite(leaf)
                 if bad.any():
                     who = np.unique(np.argwhere(bad)[:, 0]).tolist() if name == "state" and bad.ndim else ()
                     cause = f"it is {np.asarray(leaf)[bad].ravel()[0]} before the first step"
@@ -150,11 +162,13 @@ class _Run:
         t = self.t0 + (n - 1) * self.dt
         x, v, mass = before.position, before.velocity, before.mass
         for k, force in enumerate(self.scene.forces):
-            bad = _particles(force(t, x, v, mass))
+            own = {name: getattr(before, name) for name in declared(force, "reads")}
+            bad = _particles(force(t, x, v, mass, **own))
             if bad:
                 part = f"forces[{k}] {_name(force)}"
                 return self.explain("value", n, part, bad, before, _springs(force, before, bad))
-        bad = _particles(self.scene.vector_field(t, (x, v), mass)[1])
+        attributes = self.scene.attributes(before)
+        bad = _particles(self.scene.vector_field(t, (x, v), attributes)[1])
         if bad and float(jnp.max(jnp.abs(x))) < self.huge():
             light = np.broadcast_to(mass, len(x))[bad[0]]
             return Diagnosis(
@@ -170,7 +184,7 @@ class _Run:
             bad = _particles(after.position, after.velocity)
             if bad and part == _name(self.step) and hasattr(self.step, "with_info"):
                 dt = jnp.asarray(self.dt, x.dtype)
-                _, info = self.step.with_info(self.scene.vector_field, t, (x, v), dt, mass)
+                _, info = self.step.with_info(self.scene.vector_field, t, (x, v), dt, attributes)
                 return Diagnosis(
                     False,
                     "value",
@@ -221,7 +235,8 @@ class _Run:
         t = self.t0 + (n - 1) * self.dt
         x, v, mass = before.position, before.velocity, before.mass
         for k, force in enumerate(self.scene.forces):
-            value, pullback = jax.vjp(lambda force, x, v: force(t, x, v, mass), force, x, v)
+            own = {name: getattr(before, name) for name in declared(force, "reads")}
+            value, pullback = jax.vjp(lambda force, x, v, own=own: force(t, x, v, mass, **own), force, x, v)
             of_force, *of_motion = pullback(jnp.ones_like(value))
             who = _particles(*of_motion)
             if who or not bool(_tree.all_finite(of_force)):
@@ -272,7 +287,8 @@ class _Run:
         """The stability limit at the initial state; inf where it cannot be found."""
         motion = self.state.position, self.state.velocity
         try:
-            return stability_limit(self.scene.vector_field, self.t0, motion, self.state.mass, step=self.step)
+            attributes = self.scene.attributes(self.state)
+            return stability_limit(self.scene.vector_field, self.t0, motion, attributes, step=self.step)
         except ValueError:
             return np.inf
 

@@ -204,8 +204,8 @@ def simulate(
     early = any(declared(effect, "before_motion", False) for effect in scene.effects)
 
     def field(t, motion, attributes):  # on components, as they are carried from step to step
-        slope = prepared.vector_field(t, tuple(map(stack, motion)), attributes)
-        return tuple(map(split, slope))
+        position, velocity = map(stack, motion)
+        return tuple(map(split, prepared.vector_field(t, (position, velocity), attributes)))
 
     def apply(n, t, previous, state, *, before_motion):
         for index, effect in enumerate(scene.effects):

@@ -137,12 +137,11 @@ class Linearisation:
         counts = moving & ~grows
         if not counts.any():
             return math.inf, math.inf
-        chosen = np.resize(
-            np.flatnonzero(counts), rates.size
-        )  # always as many, so that one program serves all states
+        # always as many, so that one program serves all states
+        chosen = np.resize(np.flatnonzero(counts), rates.size)
         rates, modes = rates[chosen], modes[:, chosen]
         rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
-        if treats_all_alike(step):
+        if treats_all_alike(step):  # type: ignore[arg-type]
             limit = float(np.min(scalar_limits(step, rates)))
             bound = limit if math.isinf(interval) else float(np.min(scalar_limits(step, rates, interval)))
             return limit, max(limit, bound)
