@@ -196,8 +196,7 @@ def solve_adaptive(
     dt0: Any = None,
     max_steps: int = 4096,
 ) -> AdaptiveSolution:
-    """Advance y' = f(t, y, args) to given times with steps chosen so that each one's estimated error is
-    allowed.
+    """Advance y' = f(t, y, args) to given times, each step sized so that its estimated error is within tolerance.
 
         accept if rms(error / (atol + rtol max(|y|, |y_next|))) <= 1;   dt <- dt min(5, max(0.2, 0.9
         rms^(-1/k)))

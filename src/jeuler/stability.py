@@ -101,6 +101,7 @@ class Linearisation:
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
         self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # the data's own roundoff
         y, args = cast(y, np.float64), cast(args, np.float64)
+        structure: Any
         leaves, structure = jax.tree.flatten(y)
         split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
         self.complex = any(isinstance(part, tuple) for part in split)

@@ -23,7 +23,18 @@ MOST_ADAPTIVE_STEPS = 100_000
 
 @dataclasses.dataclass(frozen=True)
 class Compensated:
-    """A step to be summed with compensation; in the ``steps`` of `work_precision` only."""
+    """A step to be summed with compensation; in the ``steps`` of `work_precision` only.
+
+    Args:
+      step: an explicit step.
+    Raises: ValueError, in `work_precision`, if the step has no increment.
+    Example:
+      >>> import jeuler
+      >>> jeuler.Compensated(jeuler.euler_step).step is jeuler.euler_step
+      True
+
+    Source: A. Neumaier, Rundungsfehleranalyse einiger Verfahren zur Summation endlicher Summen, 1974.
+    """
 
     step: Step
 

@@ -99,7 +99,7 @@ class Collisions:
     def over_step(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         """The state after the step, given the state before it."""
         x, v = previous.position, previous.velocity
-        here = _Step(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass)
+        here = _Step(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
         zero = jnp.zeros(len(x), x.dtype)
         path = Path(zero, x, state.position - x, state.velocity - v, jnp.zeros_like(v))
         path, _ = lax.scan(lambda path, _: (here.next_impact(path), None), path, length=self.max_bounces)
@@ -132,7 +132,9 @@ def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
 class _Step:
     """One step of length dt from t0, for one `Collisions`."""
 
-    def __init__(self, contact: Collisions, t0: Array, dt: Array, x: Array, mass: Array) -> None:
+    def __init__(
+        self, contact: Collisions, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None
+    ) -> None:
         self.t0, self.dt = t0.astype(x.dtype), dt.astype(x.dtype)
         self.colliders = contact.colliders
         self.restitution = contact.restitution.astype(x.dtype)
@@ -140,6 +142,7 @@ class _Step:
         self.radius = jnp.broadcast_to(contact.radius.astype(x.dtype), len(x))
         self.inverse_mass = jnp.broadcast_to(1 / mass.astype(x.dtype), len(x))
         self.i, self.j = np.array(contact.pairs, np.int32).reshape(-1, 2).T
+        self.both_alive = True if alive is None else alive[self.i] & alive[self.j]
 
     def gap(self, collider: Collider, s: Array, x: Array) -> Array:
         """The distance between the surfaces of collider and particles, (particle,), m."""
@@ -248,7 +251,7 @@ class _Step:
         root_of = jnp.sqrt(jnp.where(crossing, b * b - a * c, 1))
         delay = jnp.where(crossing, c / jnp.where(crossing, root_of - b, 1), jnp.inf)
         s = start + jnp.where(touching, 0, delay)
-        return jnp.where(s <= 1, s, jnp.inf)
+        return jnp.where((s <= 1) & self.both_alive, s, jnp.inf)
 
     def first_of_their_balls(self, now: Array, times: Array, first: Array, done: Array) -> Array:
         """The pairs whose meeting is the next impact of both their balls; at a tie, the pair written first."""
@@ -288,7 +291,8 @@ class _Step:
         x = path.x + (end - path.s)[:, None] * path.displacement(self.dt)
         if len(self.i):
             apart = x[self.i] - x[self.j]
-            overlap = self.radius[self.i] + self.radius[self.j] - length(apart)
+            reach = self.radius[self.i] + self.radius[self.j]
+            overlap = jnp.where(self.both_alive, reach - length(apart), 0)
             v = v + self.exchange(overlap > 0, x, v, 0)
             x = x + self.share(jnp.maximum(overlap, 0)[:, None] * unit(apart))
         for collider in self.colliders:

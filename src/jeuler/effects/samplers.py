@@ -40,11 +40,15 @@ class Uniform:
       low: () or (component,). Differentiable.
       high: () or (component,). Differentiable.
     Returns: called as ``sampler(key, count)``, (count,) or (count, component).
+    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.Uniform(1.0, 2.0)(jax.random.key(0), 100)
       >>> x.shape, bool((x >= 1).all() and (x < 2).all())
       ((100,), True)
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
+      sect. 2 (attributes drawn at birth).
     """
 
     low: Array
@@ -68,10 +72,14 @@ class Normal:
       mean: () or (component,). Differentiable.
       deviation: standard deviation, () or (component,). Differentiable.
     Returns: called as ``sampler(key, count)``, (count,) or (count, component).
+    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> jeuler.Normal([0.0, 1.0], 0.1)(jax.random.key(0), 5).shape
       (5, 2)
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
+      sect. 2 (attributes drawn at birth).
     """
 
     mean: Array
@@ -93,10 +101,14 @@ class Choice:
     Args:
       values: (choice, ...). Differentiable; which row is drawn is not.
     Returns: called as ``sampler(key, count)``, (count, ...).
+    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> sorted(set(jeuler.Choice([1.0, 5.0])(jax.random.key(0), 50).tolist()))
       [1.0, 5.0]
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
+      sect. 2 (attributes drawn at birth).
     """
 
     values: Array
@@ -118,11 +130,15 @@ class FromLine:
       start: (dim,), m. Differentiable.
       end: (dim,), m. Differentiable.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.FromLine([0.0, 1.0], [2.0, 1.0])(jax.random.key(0), 3)
       >>> x.shape, x[:, 1].tolist()
       ((3, 2), [1.0, 1.0, 1.0])
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
+      sect. 2 (attributes drawn at birth).
     """
 
     start: Array
@@ -146,11 +162,15 @@ class FromDisc:
       radius: (), m. Differentiable.
       normal: (3,), the axis of a disc in space; ignored in the plane.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.FromDisc([0.0, 0.0, 5.0], 1.0)(jax.random.key(0), 4)
       >>> x.shape, x[:, 2].tolist()
       ((4, 3), [5.0, 5.0, 5.0, 5.0])
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
+      sect. 2 (attributes drawn at birth).
     """
 
     center: Array
@@ -181,6 +201,7 @@ class FromSphere:
       radius: (), m. Differentiable.
       surface: True draws from the surface only.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: nothing of its own.
     Example:
       >>> import jax, jax.numpy as jnp, jeuler
       >>> x = jeuler.FromSphere([0.0, 0.0, 0.0], 2.0, surface=True)(jax.random.key(0), 4)
@@ -262,6 +283,7 @@ class Cone:
       speed: (), m/s, or a sampler of it. Differentiable.
       angle: half the opening angle, (), rad; pi is every direction. Differentiable.
     Returns: called as ``sampler(key, count)``, (count, dim), m/s.
+    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> jet = jeuler.Cone([0.0, 0.0, 1.0], speed=jeuler.Uniform(4.0, 6.0), angle=0.2)

@@ -2,6 +2,7 @@
 
 from jeuler.plotting.accuracy import plot_work_precision
 from jeuler.plotting.fit import plot_fit
+from jeuler.plotting.render import Camera, animate, draw
 from jeuler.plotting.teaching import (
     error_against_dt,
     euler_polygon,
@@ -12,6 +13,9 @@ from jeuler.plotting.teaching import (
 )
 
 __all__ = [
+    "Camera",
+    "animate",
+    "draw",
     "error_against_dt",
     "euler_polygon",
     "local_and_cumulative_error",
