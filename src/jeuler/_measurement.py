@@ -259,7 +259,7 @@ def _report(
         "mass": mass.tolist(),
         "springs": springs,
         "modes": [
-            {"natural_frequency": m.angular_frequency, "damping_ratio": m.damping_ratio} for m in _modes(found, pairs)
+            {"natural_frequency": m.angular_frequency, "damping_ratio": m.damping_ratio} for m in _modes(found)
         ],
         "rms": rms,
         "amplitude": amplitude,
@@ -277,7 +277,7 @@ def _report(
     return report
 
 
-def _modes(found: SpringFit, pairs: list[tuple[int, int]]) -> list[Mode]:
+def _modes(found: SpringFit) -> list[Mode]:
     """Modes at the mean of the fitted motion."""
     unmoved = np.nan_to_num(np.asarray(found.predicted)).mean(axis=0)
     return modes(found.scene, _tree.replace(found.state, position=found.state.position * 0 + unmoved))

@@ -53,7 +53,7 @@ def read_trajectory(path: str | os.PathLike[str], *, time: str | None = None) ->
     separator = _separator([line for _, line in lines[:50]])
     rows = [(number, _cells(line, separator)) for number, line in lines]
     header: list[str] | None = None
-    while rows and not any(_is_number(cell, separator) for cell in rows[0][1]):
+    while rows and not any(_is_number(cell) for cell in rows[0][1]):
         if header is None:
             header = rows[0][1]
         rows = rows[1:]
@@ -66,7 +66,7 @@ def read_trajectory(path: str | os.PathLike[str], *, time: str | None = None) ->
             f"separated by commas, semicolons, tabs or blanks"
         )
     names = _names(header or _commented_names(comments, width), width)
-    table = np.array([_numbers(name, number, cells, names, separator) for number, cells in rows])
+    table = np.array([_numbers(name, number, cells, names) for number, cells in rows])
     clock = _time_column(name, names, time)
     lost = np.flatnonzero(np.isnan(table[:, clock]))
     if lost.size:
@@ -104,7 +104,7 @@ def _cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
 
 
-def _number(cell: str, separator: str) -> float:
+def _number(cell: str) -> float:
     """The value of a cell; ValueError if it is not a finite number."""
     if cell.lower() in MISSING:
         return float("nan")
@@ -115,14 +115,14 @@ def _number(cell: str, separator: str) -> float:
     return value
 
 
-def _is_number(cell: str, separator: str) -> bool:
+def _is_number(cell: str) -> bool:
     try:
-        return not np.isnan(_number(cell, separator))
+        return not np.isnan(_number(cell))
     except ValueError:
         return False
 
 
-def _numbers(name: str, line: int, cells: list[str], names: list[str], separator: str) -> list[float]:
+def _numbers(name: str, line: int, cells: list[str], names: list[str]) -> list[float]:
     while len(cells) > len(names) and not cells[-1]:
         cells = cells[:-1]  # a separator at the end of the line
     if len(cells) != len(names):
@@ -130,7 +130,7 @@ def _numbers(name: str, line: int, cells: list[str], names: list[str], separator
     values = []
     for k, cell in enumerate(cells):
         try:
-            values.append(_number(cell, separator))
+            values.append(_number(cell))
         except ValueError:
             raise ValueError(
                 f"{name}: line {line}: column {k + 1} ({names[k]}): expected a number, got {cell!r}"

@@ -75,9 +75,9 @@ class Collisions:
 
     colliders: tuple = ()
     pairs: tuple[tuple[int, int], ...] = ()
-    radius: Array = 0.0  # type: ignore[assignment]
-    restitution: Array = 0.0  # type: ignore[assignment]
-    friction: Array = 0.0  # type: ignore[assignment]
+    radius: _tree.Parameter = 0.0
+    restitution: _tree.Parameter = 0.0
+    friction: _tree.Parameter = 0.0
     max_bounces: int = 3
 
     def __post_init__(self) -> None:

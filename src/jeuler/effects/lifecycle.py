@@ -63,8 +63,8 @@ class Emitter:
     shape: Any = None
     extra: dict[str, Any] | None = None
     bursts: tuple[tuple[float, int], ...] = ()
-    start: Array = 0.0  # type: ignore[assignment]
-    stop: Array = jnp.inf  # type: ignore[assignment]
+    start: _tree.Parameter = 0.0
+    stop: _tree.Parameter = jnp.inf
     max_births: int | None = None
 
     before_motion = True
@@ -301,7 +301,7 @@ class DeathOnContact:
     """
 
     collider: Any
-    margin: Array = 0.0  # type: ignore[assignment]
+    margin: _tree.Parameter = 0.0
 
     before_motion = True
     writes = ("alive",)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler._interpolate import interpolate, slopes
 
 
@@ -44,7 +44,7 @@ class SampledPath:
                 f"times must have shape (sample,) with two samples at least and positions (sample, ...), "
                 f"got {times.shape} and {self.positions.shape}"
             )
-        if not isinstance(times, jax.core.Tracer) and not (np.diff(np.asarray(times)) > 0).all():
+        if not _check.is_traced(times) and not (np.diff(np.asarray(times)) > 0).all():
             raise ValueError("times must increase from sample to sample; sort the samples and drop repeated times")
 
     def __call__(self, t: Any) -> Array:
