@@ -26,12 +26,12 @@ stored_p = Primitive("stored")
 
 
 def stored(x: Array) -> Array:
-    """x, worked out once and stored, where the compiler would work it out again for each of its uses.
+    """x and its cotangent, each worked out once and stored, not again for each of its uses.
 
-    XLA on CPU fuses what it thinks cheap into every consumer: the cotangent of B x, a dozen operations, would
-    be done twice, once for either end. A division it never repeats. This is one, by a number that is 1 but
-    not a constant to XLA; LLVM, which comes after, knows that no float is greater than inf and drops the
-    division.
+    XLA on CPU fuses what it thinks cheap into every consumer: what a spring gives to its two ends, a dozen
+    operations, would be done twice, once for either end. A division it never repeats. This is one, by a number
+    that is 1 but not a constant to XLA; LLVM, which comes after, knows that no float is greater than inf and
+    drops the division.
     """
     return stored_p.bind(x)
 
@@ -80,7 +80,9 @@ def _accumulate_jvp(primals, tangents, *, layout):
 
 
 def _difference_transpose(cotangents, x, *tables, layout):
-    slots = [stored(ad.instantiate_zeros(slot)) for slot in cotangents]
+    slots = map(ad.instantiate_zeros, cotangents)
+    if layout.copies == 2:  # where both ends share one slot, what is worth storing is stored by Layout.stored
+        slots = map(stored, slots)
     total = accumulate_p.bind(*slots, *tables, layout=layout)
     return [layout.copies * total, *[None] * len(tables)]
 

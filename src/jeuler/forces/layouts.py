@@ -47,6 +47,14 @@ class Layout:
         """B^T f: one array of slots a group to (particle,)."""
         return incidence.accumulate_p.bind(*slots, *self.tables, layout=self)
 
+    def stored(self, slots: list[Array]) -> list[Array]:
+        """The same slots, they and their cotangents stored if both ends of an edge read one slot.
+
+        For the d of springs, whose cotangent is a sum of products; that of the velocities is one product, better
+        worked out again at either end (cloth 64 x 64: the gradient takes 5.1 instead of 6.4 ns a spring).
+        """
+        return [incidence.stored(x) for x in slots] if self.copies == 1 else slots
+
     def to_slots(self, x: Array) -> list[Array]:
         """A value of each edge, () or (edge,), as one array a group; empty slots hold 0 where B x may not be
         0."""

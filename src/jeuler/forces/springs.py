@@ -152,7 +152,7 @@ class PreparedSprings:
         x, v = split(position), split(velocity)
         total = [jnp.zeros_like(component) for component in x]
         for layout, *parameters in zip(self.layouts, self.ks, self.kd, self.rest_length, strict=True):
-            d = zip(*map(layout.difference, x), strict=True)
+            d = zip(*(layout.stored(layout.difference(component)) for component in x), strict=True)
             relative_velocity = zip(*map(layout.difference, v), strict=True)
             forces = [spring_force(*group) for group in zip(d, relative_velocity, *parameters, strict=True)]
             shares = map(layout.accumulate, zip(*forces, strict=True))
