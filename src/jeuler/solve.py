@@ -174,6 +174,8 @@ def _scan(body: Callable, carry: PyTree, count: int, segment: int | None) -> tup
         carry, out = body(carry, None)
         return carry, jax.tree.map(lambda x: jnp.asarray(x)[None], out)
     if segment is None or segment >= count:
+        # One step a turn: with four, Euler's method on small problems runs 1.7 times faster, but the gradient of two in
+        # three of them 10 to 50 times slower, as XLA on CPU no longer makes one kernel of a turn.
         return lax.scan(body, carry, None, length=count)
     inner = functools.partial(_scan, body, count=segment, segment=None)
     many = jax.checkpoint(lambda carry, _: inner(carry), prevent_cse=False)
