@@ -252,7 +252,7 @@ GOOD = {"dt": 0.1, "num_steps": 10}
         ({"num_steps": True}, "num_steps must be a Python integer"),
         ({"save_every": 3}, "save_every must divide num_steps, got save_every=3 and num_steps=10"),
         ({"save_every": 0}, "save_every must be at least 1"),
-        ({"checkpoint": "log"}, 'checkpoint must be None, "sqrt" or a number of steps'),
+        ({"checkpoint": "log"}, 'checkpoint must be None, "sqrt", "reversible" or a number of steps'),
         ({"checkpoint": 0}, "checkpoint must be at least 1"),
         ({"compensated": True, "step": lambda f, t, y, dt, args: y}, "compensated=True needs an explicit step"),
     ],

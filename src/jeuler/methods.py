@@ -93,18 +93,22 @@ def symplectic_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any)
 
     Source: E. Hairer, C. Lubich, G. Wanner, Geometric Numerical Integration, 2006, eq. I.1.9.
     """
-    children, pair = jax.tree.flatten(y, is_leaf=lambda part: part is not y)
-    if len(children) != 2:
-        raise ValueError(
-            f"y must be the pair (position, velocity) for symplectic_euler_step, got {pair}; "
-            f"write the system as a pair, or use euler_step"
-        )
-    _, velocity = children
-    slope = f(t, y, args)
-    _, acceleration = jax.tree.leaves(slope, is_leaf=lambda part: part is not slope)
+    (_, velocity), unflatten = pair(y)
+    (_, acceleration), _ = pair(f(t, y, args))
     velocity_increment = _tree.scale(dt, acceleration)
     position_increment = _tree.scale(dt, _tree.add(velocity, velocity_increment))
-    return jax.tree.unflatten(pair, (position_increment, velocity_increment))
+    return unflatten((position_increment, velocity_increment))
+
+
+def pair(y: PyTree) -> tuple[tuple[PyTree, ...], Callable[[Any], PyTree]]:
+    """The two parts of a state (position, velocity), and the function that joins two such parts again."""
+    parts, structure = jax.tree.flatten(y, is_leaf=lambda part: part is not y)
+    if len(parts) != 2:
+        raise ValueError(
+            f"y must be the pair (position, velocity) for symplectic_euler_step, got {structure}; "
+            f"write the system as a pair, or use euler_step"
+        )
+    return tuple(parts), functools.partial(jax.tree.unflatten, structure)
 
 
 class Tableau(NamedTuple):

@@ -15,7 +15,7 @@ from jeuler._components import by_component, split, stack
 from jeuler.declare import completed, declared, name_of
 from jeuler.forces.fields import per_particle
 from jeuler.methods import Step, euler_step
-from jeuler.solve import Checkpoint, Grid, Solution, advance_by, march, no_loss
+from jeuler.solve import Checkpoint, Grid, Solution, advance_by, march, no_loss, solve_reversibly
 from jeuler.state import ParticleState, parked
 from jeuler.window import in_windows
 
@@ -172,7 +172,7 @@ def simulate(
       save_every: save each save_every-th step; must divide num_steps.
       save: ``save(t, state)`` makes what is kept of a saved state; None keeps the state.
       key: a ``jax.random.key`` for effects that draw random numbers; each gets its own at each step.
-      checkpoint: memory of reverse mode, as in `solve`.
+      checkpoint: memory of reverse mode, as in `solve`; "reversible" for scenes of forces alone.
       compensated: compensated sums of position and velocity, as in `solve`.
       windows: sizes in increasing order. Between two saved states the run works on the smallest of these many first
         slots that holds all that live or can be born, so that a large pool costs what is alive. Under ``vmap`` all
@@ -233,9 +233,25 @@ def simulate(
         state = joined(parts)
         return state if save is None else save(t, state)
 
+    if checkpoint == "reversible":
+        return _reversibly(prepared, state, field, grid, saved, step, compensated)
     start = parted(state), no_loss(parted(state)[0], compensated)
     within = in_windows(windows, scene, state, save_every)
     return march(next_state, start, grid, saved, watch=lambda parts: parts[0], within=within)
+
+
+def _reversibly(
+    scene: Scene, state: ParticleState, field: Any, grid: Grid, saved: Any, step: Step, compensated: bool
+) -> Solution:
+    """`simulate` with ``checkpoint="reversible"``: forces alone, on particles that all live."""
+    if scene.effects or state.alive is not None:
+        what = name_of(scene.effects[0]) if scene.effects else "a pool (alive)"
+        raise ValueError(f'checkpoint="reversible" cannot undo effects or births, got {what}; pass checkpoint="sqrt"')
+    motion, rest = parted(state)
+    attributes = scene.attributes(state)
+    return solve_reversibly(
+        field, motion, attributes, grid, lambda t, motion: saved(t, (motion, rest)), step, compensated
+    )
 
 
 def _on_arrays(step: Step) -> Step:

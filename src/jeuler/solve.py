@@ -14,9 +14,11 @@ from jax import Array, lax
 
 from jeuler import _check, _tree
 from jeuler.methods import Step, VectorField, euler_step
+from jeuler.reversible import check as check_reversible
+from jeuler.reversible import reversible
 
 PyTree = Any
-Checkpoint = int | Literal["sqrt"] | None
+Checkpoint = int | Literal["sqrt", "reversible"] | None
 
 
 @_tree.component()
@@ -67,7 +69,11 @@ def solve(
       save_every: save each save_every-th step; must divide num_steps.
       save: ``save(t, y)`` makes what is kept of a saved state; None keeps y.
       checkpoint: reverse mode keeps every state (None), or only one in ``checkpoint`` steps and computes the others
-        again (an integer), or one in sqrt(num_steps) ("sqrt"), so that its memory grows as sqrt(num_steps).
+        again (an integer), or one in sqrt(num_steps) ("sqrt"), so that its memory grows as sqrt(num_steps), or none
+        but the saved ones ("reversible"): `symplectic_euler_step` with an acceleration that does not depend on the
+        velocity is undone step by step, to the bit. For that, numbers are rounded to about four units in the last
+        place of the largest, and a plain run before finds the largest; there is no forward mode, and a step that could
+        not be undone (a damper) makes the gradient NaN.
       compensated: accumulate y by compensated (Kahan-Neumaier) sums: the roundoff of a long run stays near one unit
         in the last place instead of growing with the number of steps. Explicit steps only.
     Returns: `Solution`, saved states with leading axis num_steps // save_every + 1, initial value first.
@@ -84,12 +90,35 @@ def solve(
     y0 = _check.state("y0", y0)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=_tree.time_dtype(y0))
     _check.same_form("the vector field f", y0, jax.eval_shape(f, grid.t0, y0, args))
+    if checkpoint == "reversible":
+        return solve_reversibly(f, y0, args, grid, save, step, compensated)
     advance = advance_by(step, compensated=compensated)
 
     def next_state(n, t, y_and_lost):
         return advance(f, t, y_and_lost, grid.dt, args)
 
     return march(next_state, (y0, no_loss(y0, compensated)), grid, save)
+
+
+def solve_reversibly(
+    f: VectorField,
+    y0: PyTree,
+    args: Any,
+    grid: Grid,
+    save: Callable[[Array, PyTree], PyTree] | None,
+    step: Step,
+    compensated: bool,
+) -> Solution:
+    """`solve` with ``checkpoint="reversible"``."""
+    check_reversible(f, grid.t0, y0, args, step, compensated)
+    y0, between_saves = reversible(f, y0, args, grid)
+
+    def within(run, carry):
+        n, first_nonfinite, (y, lost) = carry
+        first_nonfinite, y = between_saves(n, first_nonfinite, y)
+        return n + grid.save_every, first_nonfinite, (y, lost)
+
+    return march(lambda n, t, state: state, (y0, None), grid, save, within=within)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,12 +188,12 @@ def march(
 
 
 def _segment_length(checkpoint: Checkpoint, num_steps: int) -> int | None:
-    if checkpoint is None:
+    if checkpoint is None or checkpoint == "reversible":
         return None
     if checkpoint == "sqrt":
         return max(1, math.isqrt(num_steps))
     if isinstance(checkpoint, str):
-        raise ValueError(f'checkpoint must be None, "sqrt" or a number of steps, got {checkpoint!r}')
+        raise ValueError(f'checkpoint must be None, "sqrt", "reversible" or a number of steps, got {checkpoint!r}')
     return _check.count("checkpoint", checkpoint, least=1)
 
 
