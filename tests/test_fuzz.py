@@ -1,4 +1,4 @@
-"""2,000 random scenes: nothing is lost unannounced, and jit, eager, vmap and a loop agree."""
+"""2,100 random scenes: nothing is lost unannounced; jit, eager, vmap and a loop agree in values and gradients."""
 
 import functools
 
@@ -13,35 +13,43 @@ import jeuler
 from jeuler.colliders import Plane, Sphere
 from jeuler.effects import Collisions
 
-SCENES_AT_ONCE, EXAMPLES, STEPS = 10, 50, 20
-SHAPES = {
-    "tree": (5, [[0, 1], [1, 2], [1, 3]], ()),  # particle 4 is free
+SCENES_AT_ONCE, EXAMPLES, STEPS = 25, 12, 20
+SHAPES = {  # particles, edges, colliders, pairs that collide
+    "tree": (5, [[0, 1], [1, 2], [1, 3]], (), ()),  # particle 4 is free
     "net over a floor": (
         4,
         [[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]],
         (Plane([0.0, 0.0], [0.0, 1.0]), Sphere([0.5, -0.5], 0.8)),
+        (),
     ),
+    "pool with dead slots": (4, [[0, 1], [1, 2], [2, 3]], (Plane([0.0, 0.0], [0.0, 1.0]),), ((0, 1), (2, 3))),
 }
+ROWS = [  # (scene, step, dtype, checks); few programs, for they take longer to compile than to run
+    ("tree", jeuler.euler_step, jnp.float32, ("loop", "eager")),
+    ("tree", jeuler.heun_step, jnp.float64, ()),
+    ("tree", jeuler.rk4_step, jnp.float32, ()),
+    ("tree", jeuler.implicit_euler_step, jnp.float64, ("loop",)),
+    ("tree", jeuler.linearly_implicit_euler_step, jnp.float32, ()),
+    ("net over a floor", jeuler.symplectic_euler_step, jnp.float32, ()),
+    ("pool with dead slots", jeuler.euler_step, jnp.float64, ("loop", "eager")),
+]
+NAMES = ["position", "velocity", "mass", "ks", "kd", "rest_length", "dt", "bounce"]
 
 
 @functools.cache
-def programs(shape):
-    """The run of one scene and its gradient; jitted for a batch and for one."""
-    _, edges, colliders = SHAPES[shape]
+def programs(shape, step):
+    """The run of one scene, and its value and gradient for one and for a batch."""
+    _, edges, colliders, pairs = SHAPES[shape]
 
-    def run(scene):
-        position, velocity, mass, ks, kd, rest_length, dt, bounce = scene
-        contact = Collisions(colliders, radius=0.05, restitution=bounce, friction=bounce, max_bounces=1)
-        parts = jeuler.Gravity([0.0, -9.81]), jeuler.Springs(edges, ks, kd, rest_length)
-        state = jeuler.ParticleState(position, velocity, mass)
-        solution = jeuler.simulate(
-            jeuler.Scene(parts, (contact,) if colliders else ()),
-            state,
-            dt=dt,
-            num_steps=STEPS,
-            save_every=STEPS,
-            step=jeuler.symplectic_euler_step,
+    def run(numbers, alive):
+        position, velocity, mass, ks, kd, rest_length, dt, bounce = numbers
+        contact = Collisions(colliders, pairs, radius=0.05, restitution=bounce, friction=bounce, max_bounces=1)
+        scene = jeuler.Scene(
+            (jeuler.Gravity([0.0, -9.81]), jeuler.Springs(edges, ks, kd, rest_length)),
+            (contact,) if colliders or pairs else (),
         )
+        state = jeuler.ParticleState(position, velocity, mass, alive=alive if pairs else None)
+        solution = jeuler.simulate(scene, state, dt=dt, num_steps=STEPS, save_every=STEPS, step=step)
         end = solution.y
         return jnp.sum(end.position[-1] + 0.1 * end.velocity[-1]), (end.position[-1], solution.first_nonfinite)
 
@@ -50,8 +58,8 @@ def programs(shape):
 
 
 def random_scenes(shape, dtype, seed):
-    """Coincident points, infinite and tiny masses, zero springs, resting contacts; dt to twice the limit."""
-    particles, edges, _ = SHAPES[shape]
+    """Coincident points, infinite, tiny and zero masses, zero springs, resting contacts, dead slots; dt to twice the limit."""
+    particles, edges, *_ = SHAPES[shape]
     random = np.random.default_rng(seed)
     size, springs = SCENES_AT_ONCE, len(edges)
 
@@ -71,43 +79,63 @@ def random_scenes(shape, dtype, seed):
     limit = 2 / np.sqrt(2 * springs * np.maximum(ks.max(axis=1), 1) / mass.min(axis=1).clip(max=1e3))
     dt = limit * 10.0 ** random.uniform(-4, np.log10(2), size)
     bounce = random.choice([0.0, 0.5, 1.0], size)
-    return tuple(jnp.asarray(x, dtype) for x in (position, velocity, mass, ks, kd, rest_length, dt, bounce))
+    mass = np.where(some(0.01, (particles,)), 0, mass)
+    alive = some(0.6, (particles,))
+    numbers = position, velocity, mass, ks, kd, rest_length, dt, bounce
+    return tuple(jnp.asarray(x, dtype) for x in numbers), jnp.asarray(alive)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_nothing_is_lost_unannounced(shape, dtype):
-    _, of_one, of_many = programs(shape)
-    seen = set()
+def largest_change(one, other):
+    """The largest difference of each array of two results, in parts of the largest number in it."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return max(np.max(np.abs(a - b)) / max(np.max(np.abs(a)), np.finfo(a.dtype).tiny) for a, b in pairs)
 
-    @hypothesis.settings(derandomize=True, deadline=None, max_examples=EXAMPLES, database=None)
+
+@pytest.mark.parametrize(("shape", "step", "dtype", "checks"), ROWS)
+def test_nothing_is_lost_unannounced_and_all_ways_to_run_agree(shape, step, dtype, checks):
+    run, of_one, of_many = programs(shape, step)
+    eps = np.finfo(dtype).eps
+    seen, steady = set(), 0
+
+    @hypothesis.settings(
+        derandomize=True, deadline=None, max_examples=EXAMPLES, database=None, phases=[hypothesis.Phase.generate]
+    )
     @hypothesis.given(strategies.integers(0, 2**32 - 1))
     def check(seed):
-        scenes = random_scenes(shape, dtype, seed)
-        (_, (position, lost)), gradient = of_many(scenes)
-        finite = np.asarray(jnp.isfinite(position).all(axis=(1, 2)))
-        gradient_finite = np.ones(SCENES_AT_ONCE, bool)
-        for name, leaf in zip(["position", "velocity", "mass", "ks", "kd", "L", "dt", "bounce"], gradient, strict=True):
-            leaf = np.asarray(leaf).reshape(SCENES_AT_ONCE, -1)
-            gradient_finite &= np.isfinite(leaf).all(axis=1)
-            assert (gradient_finite | (np.asarray(lost) >= 0)).all(), f"gradient of {name}, seed {seed}"
-        assert (finite | (np.asarray(lost) >= 0)).all(), f"value, seed {seed}"
-        alone = jax.tree.map(lambda x: x[0], scenes)
-        (_, (position_alone, lost_alone)), _ = of_one(alone)
-        assert lost_alone == lost[0]
-        scale = float(jnp.max(jnp.abs(position[0]))) + 1
-        tolerance = (1e-3 if dtype == jnp.float32 else 1e-9) * scale
-        np.testing.assert_allclose(position_alone, position[0], atol=tolerance, err_msg=f"seed {seed}")
+        nonlocal steady
+        scenes, alive = random_scenes(shape, dtype, seed)
+        (_, (position, lost)), gradient = jax.tree.map(np.asarray, of_many(scenes, alive))
+        random = np.random.default_rng(seed)
+        nearby = [
+            tuple(x * (1 + 8 * eps * random.choice([-1, 1], x.shape)).astype(dtype) for x in scenes) for _ in "abc"
+        ]
+        others = [jax.tree.map(np.asarray, of_many(s, alive)) for s in nearby] if checks else []
+        for k in np.flatnonzero(lost < 0):
+            here = f"scene {k} of seed {seed}"
+            assert np.isfinite(position[k]).all(), here
+            for name, leaf in zip(NAMES, gradient, strict=True):
+                assert np.isfinite(leaf[k]).all(), f"gradient of {name}, {here}"
+            result = position[k], [g[k] for g in gradient]
+            change = [largest_change(result, (o[0][1][0][k], [g[k] for g in o[1]])) for o in others]
+            # on the edge of a contact, or far over the stability limit, roundoff decides where a scene goes
+            if checks and np.max(change) < 1e3 * eps:
+                steady += 1
+                (_, (alone, lost_alone)), gradient_alone = of_one(*jax.tree.map(lambda x, k=k: x[k], (scenes, alive)))
+                assert lost_alone < 0, here
+                assert largest_change(result, jax.tree.map(np.asarray, (alone, list(gradient_alone)))) < 1e5 * eps, here
         seen.add(seed)
 
     check()
-    assert len(seen) == EXAMPLES  # times SCENES_AT_ONCE, two shapes and two dtypes: 2,000 scenes
-
-
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_eager_equals_jit(dtype):
-    run, of_one, _ = programs("tree")
-    scene = jax.tree.map(lambda x: x[0], random_scenes("tree", dtype, 1))
-    with jax.disable_jit():
-        eager, _ = run(scene)
-    np.testing.assert_allclose(eager, of_one(scene)[0][0], rtol=1e-5 if dtype == jnp.float32 else 1e-12)
+    assert len(seen) == EXAMPLES  # times SCENES_AT_ONCE, times seven rows: 2,100 scenes
+    assert not checks or steady > EXAMPLES * SCENES_AT_ONCE / 4
+    if "eager" in checks:
+        scene = jax.tree.map(lambda x: x[0], random_scenes(shape, dtype, 1))
+        with jax.disable_jit():
+            eager, _ = run(*scene)
+        np.testing.assert_allclose(eager, of_one(*scene)[0][0], rtol=1e2 * eps)
+    if shape == "pool with dead slots":  # a dead slot stays empty and has no gradient
+        scenes, alive = random_scenes(shape, dtype, 7)
+        (_, (position, lost)), gradient = jax.tree.map(np.asarray, of_many(scenes, alive))
+        assert not position[~np.asarray(alive)].any()
+        dead_and_finite = ~np.asarray(alive) & (lost < 0)[:, None]
+        assert all(not leaf[dead_and_finite].any() for leaf in gradient[:3])

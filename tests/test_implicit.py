@@ -125,16 +125,50 @@ def test_gradient_through_a_step_that_does_not_converge_is_not_finite():
     assert not jnp.isfinite(jax.grad(loss)(100.0))
 
 
+def crushed_nets(count):
+    """Ten particles in space, every pair joined by a spring of 1 m, crushed into centimetres."""
+    scene = jeuler.Scene((jeuler.Springs([(i, j) for i in range(10) for j in range(i)], 1e4, 100.0, 1.0),))
+    position = 0.02 * jnp.stack([np.random.default_rng(seed).normal(size=(10, 3)) for seed in range(count)])
+    return scene, position, jnp.zeros_like(position)
+
+
+def test_crushed_nets_that_newtons_method_alone_does_not_solve():
+    """dt = 0.05 s, five times the explicit limit: what comes out solves the equation, and the energy has fallen."""
+    scene, position, velocity = crushed_nets(10)
+    solved = {}
+    for damped_steps in (0, 500):
+        step = implicit_euler(damped_steps=damped_steps)
+        one = jax.vmap(lambda x, v, step=step: step.with_info(scene.vector_field, 0.0, (x, v), 0.05, 1.0))
+        (x, v), info = jax.jit(one)(position, velocity)
+        solved[damped_steps] = int(jnp.sum(info.converged))
+        np.testing.assert_array_equal(jnp.isfinite(x).all(axis=(1, 2)), info.converged)
+    assert solved[0] <= 2
+    assert solved[500] >= 9
+    energy = jax.vmap(lambda x, v: scene.energy(0.0, (x, v), 1.0))
+    slope_of = jax.vmap(lambda x, v: scene.vector_field(0.0, (x, v), 1.0)[1])
+    done = np.asarray(info.converged)
+    np.testing.assert_allclose(v[done], (0.05 * slope_of(x, v))[done], atol=1e-6)
+    assert np.all(energy(x, v)[done] < 0.5 * energy(position, velocity)[done])
+
+
+def test_damped_iterations_leave_alone_what_newtons_method_solves():
+    alone, helped = (
+        implicit_euler(damped_steps=n).with_info(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0) for n in (0, 500)
+    )
+    np.testing.assert_array_equal(alone[0], helped[0])
+    assert alone[1].iterations == helped[1].iterations
+
+
 def test_iterations_are_few_and_limited():
     _, info = implicit_euler_step.with_info(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0)
     assert info.converged
     assert int(info.iterations) <= 6
-    _, info = implicit_euler(max_steps=1).with_info(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0)
+    _, info = implicit_euler(max_steps=1, damped_steps=0).with_info(stiff_field, 0.0, jnp.ones(2), 0.1, 50.0)
     assert not info.converged
     assert int(info.iterations) == 1
 
 
-@pytest.mark.parametrize("bad", [{"rtol": 0.0}, {"atol": -1.0}, {"max_steps": 0}])
+@pytest.mark.parametrize("bad", [{"rtol": 0.0}, {"atol": -1.0}, {"max_steps": 0}, {"damped_steps": -1}])
 def test_bad_options(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         implicit_euler(**bad)

@@ -42,6 +42,19 @@ def positive(name: str, x: Any, unit: str = "") -> None:
         raise ValueError(f"{name} must be greater than 0{unit and ' ' + unit}, got {x!r}")
 
 
+def not_negative(name: str, x: Any, unit: str) -> None:
+    """No number in the array x is below zero. A traced x is passed over, as is NaN, which `diagnose` finds."""
+    if is_traced(x):
+        return
+    below = np.argwhere(np.asarray(x) < 0)
+    if len(below):
+        where = f" at index {', '.join(map(str, below[0]))}" if np.ndim(x) else ""
+        raise ValueError(
+            f"{name} must not be negative, got {float(np.asarray(x)[tuple(below[0])]):g} {unit}{where}; "
+            f"where gradient steps made it so, take them on its logarithm and pass jnp.exp of that, as `fit` does"
+        )
+
+
 def count(name: str, x: Any, *, least: int = 0) -> int:
     """x as a Python int of at least ``least``: it fixes the shape of the program, so it cannot be traced."""
     try:

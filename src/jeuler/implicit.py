@@ -1,7 +1,7 @@
 """Implicit steps: backward Euler by Newton's method, and its one-linear-solve form; derivatives by implicit functions.
 
-Newton's method is optimistix's and the linear solves are lineax's; ``_root.root`` and jax's ``custom_linear_solve``
-give the derivatives, in both modes and to any order, at the price of one linear solve each.
+``_newton`` solves; ``_root.root`` and jax's ``custom_linear_solve`` give the derivatives, in both modes and to any
+order, at the price of one linear solve each.
 """
 
 from __future__ import annotations
@@ -17,18 +17,11 @@ from jax.extend.core import Literal
 from jax.flatten_util import ravel_pytree
 
 from jeuler import _check, _tree
+from jeuler._newton import StepInfo, linear_solver_for, newton_then_damped, solve_linear
 from jeuler._root import root
 from jeuler.methods import Step, VectorField
 
 PyTree = Any
-DENSE_UP_TO = 128  # unknowns: below, a dense LU factorisation is faster than Krylov iterations
-
-
-class StepInfo(NamedTuple):
-    """How an implicit step was solved: whether Newton's method converged, and in how many iterations."""
-
-    converged: Array
-    iterations: Array
 
 
 def implicit_euler(
@@ -36,6 +29,7 @@ def implicit_euler(
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int = 50,
+    damped_steps: int = 500,
     linear_solver: Any = None,
 ) -> Step:
     """Make a backward (implicit) Euler step with these tolerances.
@@ -43,31 +37,34 @@ def implicit_euler(
         y(t + dt) = y + dt f(t + dt, y(t + dt), args)
 
     The equation is solved by Newton's method until the last correction of every unknown is below
-    ``atol + rtol |unknown|`` or below roundoff. A step that does not get there in max_steps iterations returns NaN, so
-    that ``Solution.first_nonfinite`` names it; ``step.with_info`` returns ``(y, StepInfo)``. Derivatives are those of
-    the exact solution (implicit function theorem), in reverse and forward mode and of any order, at one linear solve
-    each. For y = (position, velocity) with a slope of position that does not depend on position, only the velocity is
-    solved for.
+    ``atol + rtol |unknown|`` or below roundoff. Where it does not get there in max_steps iterations, as in crushed nets
+    of springs, damped iterations (pseudo-transient continuation) bring it near a solution and it starts again from
+    there. A step that does not converge even so returns NaN, so that ``Solution.first_nonfinite`` names it;
+    ``step.with_info`` returns ``(y, StepInfo)``. Derivatives are those of the exact solution (implicit function
+    theorem), in reverse and forward mode and of any order, at one linear solve each. For y = (position, velocity) with
+    a slope of position that does not depend on position, only the velocity is solved for.
 
     Args:
       rtol: relative tolerance of the unknowns; None: 1e-9 in float64, 1e-5 in float32.
       atol: absolute tolerance, in the units of the unknowns; None: 1e-3 rtol.
       max_steps: limit of Newton iterations.
+      damped_steps: limit of damped iterations, which cost nothing where Newton's method converges; 0: none.
       linear_solver: a lineax solver; None: LU up to 128 unknowns, BiCGStab without a matrix above.
     Returns: a step ``(f, t, y, dt, args) -> y`` for `solve` and `simulate`. Its cumulative error is O(dt).
-    Raises: ValueError, if a tolerance is not positive or max_steps is below 1.
+    Raises: ValueError, if a tolerance is not positive, max_steps is below 1 or damped_steps below 0.
     Example:
       >>> import jeuler
       >>> step = jeuler.implicit_euler(max_steps=100)
       >>> round(float(step(lambda t, y, args: -1e6 * (y - t), 0.0, 1.0, 0.1, None)), 4)
       0.1
 
-    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8.
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8; damped
+      iterations: C. T. Kelley, D. E. Keyes, SIAM J. Numer. Anal. 35, 1998.
     """
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
         if tolerance is not None:
             _check.positive(name, tolerance)
-    max_steps = _check.count("max_steps", max_steps, least=1)
+    max_steps, damped_steps = _check.count("max_steps", max_steps, least=1), _check.count("damped_steps", damped_steps)
 
     def with_info(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, StepInfo]:
         system = _system(f, t, y, dt, args)
@@ -80,13 +77,14 @@ def implicit_euler(
         def scaled_residual(z):  # in units of the tolerance, so that solvers see numbers of one kind
             return system.residual(z * scale) / scale
 
-        newton = _newton(relative, max_steps, linear_solver or _linear_solver(floor, rtol=1e-4, atol=0.1))
-        z, info = root(
-            scaled_residual,
-            system.start / scale,
-            newton,
-            functools.partial(_solve_linear, solver=linear_solver),
+        solve = newton_then_damped(
+            rtol=relative,
+            max_steps=max_steps,
+            damped_steps=damped_steps,
+            linear_solver=linear_solver or linear_solver_for(floor, rtol=1e-4, atol=0.1),
         )
+        tangent_solve = functools.partial(solve_linear, solver=linear_solver)
+        z, info = root(scaled_residual, system.start / scale, solve, tangent_solve)
         return system.state(z * scale * jnp.where(info.converged, 1, jnp.nan)), info
 
     def implicit_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
@@ -100,7 +98,7 @@ def implicit_euler(
           y: state, any pytree of floating or complex arrays.
           dt: step size, scalar, s. Every dt is stable where the equation itself is.
           args: passed to f; any pytree.
-        Returns: the state at t + dt, NaN if Newton's method did not converge. Its cumulative error is O(dt).
+        Returns: the state at t + dt, NaN if it did not converge. Its cumulative error is O(dt).
         Raises: ValueError, at trace time, if y is not floating. See `implicit_euler` for its tolerances.
         Example:
           >>> import jeuler
@@ -169,7 +167,7 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
         if not system.start.size:
             return y
         value, matvec = jax.linearize(system.residual, system.start)
-        return system.state(system.start - _solve_linear(matvec, value, solver=linear_solver))
+        return system.state(system.start - solve_linear(matvec, value, solver=linear_solver))
 
     linearly_implicit_euler_step.order = 1  # type: ignore[attr-defined]
     return linearly_implicit_euler_step
@@ -191,7 +189,7 @@ class System(NamedTuple):
 def _system(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, velocity_decides: bool | None = None) -> System:
     """Backward Euler as an equation for y, or for the velocity alone where it decides the position.
 
-        u - y - dt f(t + dt, u) = 0   or   u - v - dt a(t + dt, x + dt v(u), u) = 0
+    u - y - dt f(t + dt, u) = 0   or   u - v - dt a(t + dt, x + dt v(u), u) = 0
     """
     y = _check.state("y", y)
 
@@ -262,60 +260,3 @@ def _real_vector(y: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
 def _largest(y: PyTree) -> Array:
     """The largest absolute value in y; 0 where there is none."""
     return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0) for leaf in jax.tree.leaves(y)]))
-
-
-@functools.cache
-def _newton_class() -> Any:
-    import optimistix
-
-    class Newton(optimistix.Newton):
-        """Newton's method that is done when the correction is small.
-
-        optimistix asks that the residual be small too, which rounding forbids where dt |J| is large.
-        """
-
-        def terminate(self, fn, y, args, options, state, tags):
-            failed = state.result != optimistix.RESULTS.successful
-            return failed | (state.diffsize <= 1), state.result
-
-    return Newton
-
-
-def _newton(rtol: float, max_steps: int, linear_solver: Any) -> Callable:
-    """``solve(residual, guess) -> (root, StepInfo)``, in units of the absolute tolerance."""
-    import optimistix
-
-    def solve(residual, guess):
-        solver = _newton_class()(rtol=rtol, atol=1.0, linear_solver=linear_solver)
-        solution: Any = optimistix.root_find(
-            lambda z, args: residual(z), solver, guess, max_steps=max_steps, throw=False
-        )
-        converged = solution.result == optimistix.RESULTS.successful
-        return solution.value, StepInfo(jnp.asarray(converged), solution.stats["num_steps"].astype(jnp.int32))
-
-    return solve
-
-
-def _linear_solver(like: Array, *, rtol: float, atol: float) -> Any:
-    """LU for few unknowns, BiCGStab without a matrix for many."""
-    import lineax
-
-    return lineax.LU() if like.size <= DENSE_UP_TO else lineax.BiCGStab(rtol=rtol, atol=atol)
-
-
-def _solve_linear(matvec: Callable[[Array], Array], b: Array, *, solver: Any) -> Array:
-    """x with matvec(x) = b, close to roundoff; NaN where the solver fails. Differentiable to any order."""
-    import lineax
-
-    tolerance = 1e-12 if b.dtype == jnp.float64 else 1e-6
-    solver = solver or _linear_solver(b, rtol=tolerance, atol=tolerance)
-
-    def solve(matvec, b):
-        size = jnp.max(jnp.abs(b))
-        size = jnp.where(size > 0, size, 1)
-        operator = lineax.FunctionLinearOperator(matvec, jax.eval_shape(lambda: b))
-        solution = lineax.linear_solve(operator, b / size, solver, throw=False)
-        solved = solution.result == lineax.RESULTS.successful
-        return solution.value * size * jnp.where(solved, 1, jnp.nan)
-
-    return lax.custom_linear_solve(matvec, b, solve, solve)

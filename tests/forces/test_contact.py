@@ -33,6 +33,21 @@ def test_ball_settles_where_the_spring_carries_its_weight():
     np.testing.assert_allclose(end.y.position[-1], -10 / 1000, rtol=1e-6)
 
 
+def test_gradient_through_a_bounce_is_that_of_the_spring():
+    """d(height at 0.6 s)/d(height at 0) of an elastic ball from 0.6 m, against finite differences."""
+    scene = jeuler.Scene((jeuler.Gravity([-10.0]), PenaltyContact(Plane([0.0], [1.0]), ks=1e4)))
+
+    @jax.jit
+    def end(height):
+        state = jeuler.ParticleState(height[None, None], jnp.zeros((1, 1)))
+        run = jeuler.simulate(scene, state, dt=1e-3, num_steps=600, save_every=600, step=jeuler.symplectic_euler_step)
+        return run.y.position[-1, 0, 0]
+
+    h = 1e-7
+    difference = (end(jnp.array(0.6 + h)) - end(jnp.array(0.6 - h))) / (2 * h)
+    np.testing.assert_allclose(jax.grad(end)(jnp.array(0.6)), difference, rtol=1e-5)
+
+
 def test_bad_shape():
     scene = jeuler.Scene((PenaltyContact(Plane([0.0], [1.0]), ks=[1.0, 2.0]),))
     with pytest.raises(ValueError, match=r"PenaltyContact\.ks must have shape"):

@@ -328,6 +328,29 @@ def test_a_lost_member_of_a_batch_leaves_the_others_alone(random):
         np.testing.assert_array_equal(sound.y.position[k], broken.y.position[k])
 
 
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("name", graphs())
+def test_a_linearised_force_with_a_copy_of_its_tables_for_each_member(name, moving, random):
+    """A batched loop that keeps a Jacobian, such as Levenberg-Marquardt's, selects each of its arrays by member."""
+    edges, _ = graphs()[name]
+    position, direction = jnp.asarray(random.normal(size=(2, PARTICLES, 2)))
+
+    def force(p):
+        return spring_force(edges)(p, jnp.zeros_like(p), 1.0, 0.0, 1.0)
+
+    _, push = jax.linearize(force, position)
+    leaves, tree = jax.tree.flatten(push)
+
+    def derivative(kept, scale):
+        selected = tree.unflatten([jnp.where(kept, x, jnp.zeros_like(x)) for x in leaves])
+        d = scale * direction if moving else direction
+        return selected(d), *jax.linear_transpose(selected, d)(d)
+
+    got = jax.jit(jax.vmap(derivative))(jnp.array([True, True]), jnp.array([1.0, 3.0]))
+    expected = jax.jvp(force, (position,), (direction,))[1]  # symmetric
+    check_equal(got, [jnp.stack([expected, (3.0 if moving else 1.0) * expected])] * 2)
+
+
 def test_importing_jeuler_imports_nothing_heavy():
     program = (
         "import sys, jax; before = set(sys.modules); import jeuler; "

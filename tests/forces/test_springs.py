@@ -104,3 +104,25 @@ def test_oscillation_against_the_exact_solution():
     omega = np.sqrt(ks / mass - decay**2)
     exact = 1 + 0.3 * np.exp(-decay * run.t) * (np.cos(omega * run.t) + decay / omega * np.sin(omega * run.t))
     np.testing.assert_allclose(run.y.position[:, 1, 0], exact, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "where"), [("ks", -3.0, ""), ("kd", [0.1, -0.2], "at index 1"), ("rest_length", -1e-3, "")]
+)
+def test_negative_parameters_are_refused_before_tracing(name, value, where):
+    parameters = {"ks": 1.0, "kd": 0.0, "rest_length": 1.0} | {name: value}
+    scene = jeuler.Scene((jeuler.Springs([[0, 1], [1, 2]], **parameters),))
+    state = jeuler.ParticleState([[0.0], [1.0], [2.0]], jnp.zeros((3, 1)))
+    with pytest.raises(ValueError, match=rf"Springs.{name} must not be negative, got -.*{where}; .*logarithm"):
+        jeuler.simulate(scene, state, dt=0.1, num_steps=1)
+
+
+def test_a_traced_negative_parameter_passes_as_nobody_can_look_at_it():
+    state = jeuler.ParticleState([[0.0], [1.5]], jnp.zeros((2, 1)))
+
+    def end(ks):
+        scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks, 0.0, 1.0),))
+        return jeuler.simulate(scene, state, dt=0.1, num_steps=2).y.position[-1, 1, 0]
+
+    np.testing.assert_allclose(jax.jit(end)(-1.0), 1.5 + 0.01 * 0.5)
+    assert np.isfinite(jax.grad(end)(-1.0))

@@ -140,6 +140,7 @@ class _Step:
         self.restitution = contact.restitution.astype(x.dtype)
         self.friction = contact.friction.astype(x.dtype)
         self.radius = jnp.broadcast_to(contact.radius.astype(x.dtype), len(x))
+        mass = mass if alive is None else jnp.where(alive, mass, jnp.inf)  # whatever the mass of a dead slot is
         self.inverse_mass = jnp.broadcast_to(1 / mass.astype(x.dtype), len(x))
         self.i, self.j = np.array(contact.pairs, np.int32).reshape(-1, 2).T
         self.both_alive = True if alive is None else alive[self.i] & alive[self.j]

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler.colliders import check_collider, normal_and_speed
 
 
@@ -27,7 +27,7 @@ class PenaltyContact:
       kd: damping of the approach, (), N s/m. Differentiable.
       radius: of each particle, () or (particle,), m. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
-    Raises: ValueError, in `simulate`, if a shape does not fit.
+    Raises: ValueError, in `simulate`, if a shape does not fit or a parameter that is not traced is negative.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> floor = jeuler.PenaltyContact(jeuler.Plane([0.0, 0.0], [0.0, 1.0]), ks=100.0)
@@ -68,4 +68,6 @@ class PenaltyContact:
                 raise ValueError(
                     f"PenaltyContact.{name} must have shape {' or '.join(map(str, shapes))}, got {shape}"
                 )
+        for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("radius", "m")):
+            _check.not_negative(f"PenaltyContact.{name}", getattr(self, name), unit)
         check_collider(self.collider, dim)

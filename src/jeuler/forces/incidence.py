@@ -97,17 +97,32 @@ def _batch_first(x: Any, axis: Any, size: int) -> Any:
     return batching.bdim_at_front(x, axis, size)
 
 
+def _of_one_member(tables: Any, axes: Any) -> list[Any]:
+    """The tables, which are the same for all: a loop whose carry holds them may have made a copy for each member."""
+    return [
+        x if axis is None else lax.index_in_dim(x, 0, axis, keepdims=False)
+        for x, axis in zip(tables, axes, strict=True)
+    ]
+
+
 def _difference_batch(operands, axes, *, layout):
     x, *tables = operands
+    tables = _of_one_member(tables, axes[1:])
+    if axes[0] is None:
+        out = difference_p.bind(x, *tables, layout=layout)
+        return out, [None] * len(out)
     out = difference_p.bind(jnp.moveaxis(x, axes[0], 0), *tables, layout=layout)
     return out, [0] * len(out)
 
 
 def _accumulate_batch(operands, axes, *, layout):
     groups = len(layout.slot_edges)
-    size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
-    slots = [_batch_first(x, axis, size) for x, axis in zip(operands[:groups], axes[:groups], strict=True)]
-    return accumulate_p.bind(*slots, *operands[groups:], layout=layout), 0
+    tables = _of_one_member(operands[groups:], axes[groups:])
+    sizes = [x.shape[axis] for x, axis in zip(operands[:groups], axes[:groups], strict=True) if axis is not None]
+    if not sizes:
+        return accumulate_p.bind(*operands[:groups], *tables, layout=layout), None
+    slots = [_batch_first(x, axis, sizes[0]) for x, axis in zip(operands[:groups], axes[:groups], strict=True)]
+    return accumulate_p.bind(*slots, *tables, layout=layout), 0
 
 
 stored_p.def_impl(lambda x: x)

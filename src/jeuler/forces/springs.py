@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler._components import split, stack
 from jeuler.forces.incidence import stored
 from jeuler.forces.layouts import Layout
@@ -84,7 +84,7 @@ class Springs:
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim),
       N.
     Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in
-      `simulate`, if an index is out of range or a parameter has another shape.
+      `simulate`, if an index is out of range, a parameter has another shape, or one that is not traced is negative.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> spring = jeuler.Springs([[0, 1]], ks=10.0, kd=0.0, rest_length=1.0)
@@ -136,6 +136,8 @@ class Springs:
                 raise ValueError(
                     f"Springs.{name} must have shape () or ({len(self.edges)},), one a spring, got {shape}"
                 )
+        for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("rest_length", "m")):
+            _check.not_negative(f"Springs.{name}", getattr(self, name), unit)
 
 
 @_tree.component(static=("layouts",))
