@@ -199,8 +199,8 @@ def simulate(
     _check.same_form("the sum of forces", motion, form)
     _check_effects(scene, state, grid, key)
     advance = advance_by(step if hasattr(step, "increment") else _on_arrays(step), compensated=compensated)
-    # a pool's springs change with who is alive, so there is nothing to prepare
-    prepared = scene if state.alive is not None else scene.prepare(len(state.position), motion[0].dtype)
+    # each window would need springs laid out for its own size
+    prepared = scene if windows else scene.prepare(len(state.position), motion[0].dtype)
     early = any(declared(effect, "before_motion", False) for effect in scene.effects)
 
     def field(t, motion, attributes):  # on components, as they are carried from step to step

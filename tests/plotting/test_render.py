@@ -14,7 +14,8 @@ from PIL import Image
 from jeuler import ParticleState, Scene, Solution, Springs
 from jeuler.colliders import Box, Plane, Sphere
 from jeuler.effects.collisions import Collisions
-from jeuler.plotting.render import Camera, animate, draw, new_axes
+from jeuler.plotting import Camera, animate, draw
+from jeuler.plotting.camera import new_axes
 from jeuler.plotting.solids import in_sight
 
 FRAMES = 4
