@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import matplotlib
 import numpy as np
-from matplotlib import animation
+from matplotlib import animation, colors
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
@@ -109,7 +109,7 @@ class Film:
         """The player that a notebook shows."""
         import tempfile
 
-        with tempfile.TemporaryDirectory() as folder, matplotlib.rc_context({"animation.embed_limit": 60}):
+        with tempfile.TemporaryDirectory() as folder, matplotlib.rc_context({"animation.embed_limit": 1e4}):
             path = pathlib.Path(folder) / "film.html"
             self.write(path, animation.HTMLWriter(fps=self.fps, embed_frames=True, default_mode="loop"))
             return path.read_text(encoding="utf-8")
@@ -120,6 +120,7 @@ class Film:
         times = np.asarray(self.solution.t)[:: self.every]
         ax = new_axes(state.position.shape[-1], self.look.background, self.size)
         view = View.of(self.camera, state.position, alive_of(state))
+        dark = np.mean(colors.to_rgb(self.look.background)) < 0.5
 
         def frames() -> Iterator[None]:
             from tqdm import tqdm
@@ -130,7 +131,9 @@ class Film:
                 picture = picture or Picture(ax, self.scene, view, self.look, frame, float(times[n]))
                 picture.update(frame, float(times[n]))
                 if self.title:
-                    ax.figure.suptitle(self.title.format(t=f"{times[n]:.2f}"), y=0.97)
+                    ax.figure.suptitle(
+                        self.title.format(t=f"{times[n]:.2f}"), y=0.97, color="white" if dark else "black"
+                    )
                 yield
 
         return ax.figure, frames()

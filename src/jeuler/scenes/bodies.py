@@ -70,7 +70,7 @@ def cloth_on_sphere(side: int = 32) -> Setup:
         LinearDrag(0.004, air=air),
     )
     solids = (Sphere([0.0, 0.0, 0.0], 0.6), Plane([0.0, 0.0, -0.8], [0.0, 0.0, 1.0]))
-    start = cloth.position + [0.0, 0.0, 0.75]
+    start = cloth.position + np.array([0.0, 0.0, 0.75])
     state = ParticleState(start, 0 * start, mass=0.004, color=np.tile([0.72, 0.22, 0.2], (side**2, 1)))
     camera = {"center": [0.0, 0.0, 0.0], "width": 3.0, "elevation": 22.0}
     look = {"faces": cloth.faces, "links": None, "particles": False}
