@@ -1,6 +1,6 @@
 """How long a film takes to draw and to write: python benchmarks/rendering.py [FOLDER]
 
-10,000 particles with colours, opacities and sizes of their own, 200 frames of 480 x 360 pixels, in the plane and in space.
+10,000 particles with colours, opacities and sizes of their own, 200 frames of 480 x 360 pixels, in 2-D and in 3-D.
 """
 
 import os

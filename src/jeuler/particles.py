@@ -153,7 +153,7 @@ def simulate(
     key: Array | None = None,
     checkpoint: Checkpoint = None,
     compensated: bool = False,
-    windows: tuple[int, ...] = (),
+    windows: tuple[int, ...] | str = (),
 ) -> Solution:
     """Run a scene: num_steps steps of its equation of motion and its effects, in one ``lax.scan``.
 
@@ -174,9 +174,9 @@ def simulate(
       key: a ``jax.random.key`` for effects that draw random numbers; each gets its own at each step.
       checkpoint: memory of reverse mode, as in `solve`.
       compensated: compensated sums of position and velocity, as in `solve`.
-      windows: sizes in increasing order. Between two saved states the run works on the smallest of these many first
-        slots that holds all that live or can be born, so that a large pool costs what is alive. Under ``vmap`` all
-        sizes run: leave it empty there.
+      windows: sizes in increasing order, or "auto" for a ladder of them. Between two saved states the run works on
+        the smallest of these many first slots that holds all that live or can be born, so that a large pool costs
+        what is alive. Each size is compiled. Under ``vmap`` all sizes run: leave it empty there.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:

@@ -148,7 +148,7 @@ def test_springs_take_the_colour_of_their_particles_or_are_not_drawn():
 
 def test_faces_are_lit_and_those_behind_a_solid_are_left_out():
     corners = np.array([[0.0, -1, -1], [0, 1, -1], [0, 0, 1]])
-    position = np.concatenate([corners + [3.0, 0, 0], 0.5 * corners - [3.0, 0, 0], corners - [6.0, 0, 5.0]])
+    position = np.concatenate([corners + np.array([3.0, 0, 0]), 0.5 * corners - [3.0, 0, 0], corners - [6.0, 0, 5.0]])
     frame = ParticleState(position, 0 * position, color=np.tile([1.0, 0.5, 0.0], (9, 1)))
     scene = Scene(effects=(Collisions((Sphere([0.0, 0.0, 0.0], 2.0),)),))
     look = Look(faces=[[0, 1, 2], [3, 4, 5], [6, 7, 8]], particles=False)
