@@ -63,13 +63,15 @@ def program(scene, state, *, save_every=25, windows=()):
             zero = jax.numpy.int32(0)
             births = zero if state.births is None else state.births
             missed = zero if state.missed_births is None else state.missed_births
-            return births, missed, zero + len(state.position) if state.alive is None else state.alive.sum()
+            alive = zero + len(state.position) if state.alive is None else state.alive.sum()
+            seen = state.position.sum() + state.opacity.sum()  # or the compiler would leave the motion out
+            return births, missed, alive, seen
 
         solution = simulate(
             scene, state, dt=DT, num_steps=STEPS, save_every=save_every, key=key, windows=windows, save=counts,
             step=symplectic_euler_step,
         )  # fmt: skip
-        return solution.y, state.position.sum()
+        return solution.y
 
     arguments = scene, state, jax.random.key(0)
     start = time.perf_counter()
@@ -90,13 +92,13 @@ def main() -> None:
         "no windows": program(*full),
     }
     seconds: dict[str, list[float]] = {name: [] for name in programs}
-    counts = {name: run()[0] for name, (run, _) in programs.items() if name != "no windows"}
+    counts = {name: run() for name, (run, _) in programs.items() if name != "no windows"}
     for repeat in range(REPEATS):
         for name, (run, _) in programs.items():
             if name == "no windows" and repeat:
                 continue  # slow, and beside the point
             start = time.perf_counter()
-            counts[name] = run()[0]
+            counts[name] = run()
             seconds[name].append(time.perf_counter() - start)
 
     print(f"{platform.machine()}, {os.cpu_count()} CPUs, jax {jax.__version__}, float32, {STEPS} steps, {REPEATS} runs")
@@ -105,7 +107,7 @@ def main() -> None:
     medians = {name: statistics.median(times) for name, times in seconds.items()}
     none, small = medians["5,000 particles, no pool"], medians["5,500 slots, 300,000 used"]
     for name, median in medians.items():
-        births, missed, alive = (int(x[-1]) for x in counts[name])
+        births, missed, alive = (int(x[-1]) for x in counts[name][:3])
         print(
             f"| {name} | {ALIVE + births:,} | {alive:,} | {missed} | {programs[name][1]:.1f} | "
             f"{1e6 * median / STEPS:.0f} | {median / none:.2f} | {median / small:.2f} |"

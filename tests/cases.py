@@ -174,10 +174,10 @@ EFFECTS = {
 
 
 def kinds_in(part):
-    """The names of the library's classes in a force or effect, at any depth."""
-    names = {type(part).__name__} if type(part).__module__.startswith("jeuler") else set()
-    children = part if isinstance(part, (tuple, list)) else vars(part).values() if names else ()
-    return names.union(*map(kinds_in, children))
+    """The names of the public classes in a force or effect, at any depth."""
+    ours = type(part).__module__.startswith("jeuler")
+    children = part if isinstance(part, (tuple, list)) else vars(part).values() if ours else ()
+    return {type(part).__name__}.intersection(jeuler.__all__).union(*map(kinds_in, children))
 
 
 def force_state(name, dtype=jnp.float64):
