@@ -65,7 +65,7 @@ def on_first(size: int, capacity: int, run: Run) -> Run:
     return run if size == capacity else narrow
 
 
-def checked_sizes(sizes: tuple[int, ...], capacity: int, scene: Any, state: Any) -> tuple[int, ...]:
+def checked_sizes(sizes: tuple[int, ...] | str, capacity: int, scene: Any, state: Any) -> tuple[int, ...]:
     """The sizes, if they increase and every force and effect can work on a part of the slots; or one ValueError."""
     if isinstance(sizes, str):
         raise ValueError(f'windows must be "auto" or sizes in increasing order, got {sizes!r}')

@@ -53,7 +53,7 @@ def cube(side: int, width: float) -> Body:
     along = np.linspace(-width / 2, width / 2, side)
     faces = []
     for axis in range(3):
-        for skin in (g.take(0, axis), g.take(-1, axis)):
+        for skin in (g.take([0], axis).squeeze(axis), g.take([-1], axis).squeeze(axis)):
             a, b, c, d = skin[:-1, :-1], skin[1:, :-1], skin[1:, 1:], skin[:-1, 1:]
             faces += [rows(a, b, c), rows(a, c, d)]
     return Body(
