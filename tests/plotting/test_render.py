@@ -181,6 +181,18 @@ def test_the_camera_follows():
     assert np.allclose(np.mean(mean.get_ylim()), frame.position[:, 1].mean())
 
 
+def test_the_ground_fills_the_picture_to_its_edges(tmp_path):
+    """Whatever the shape of the cloud, and of the picture."""
+    frame = ParticleState([[0.0, 0.0], [0.1, 3.0]], np.zeros((2, 2)))
+    ground = Scene(effects=(Collisions((Plane([0.0, 1.0], [0.0, 1.0]),)),))
+    for size in ((6.0, 4.5), (3.0, 6.0)):
+        save_picture(tmp_path / "ground.png", frame, ground, size=size)
+        pixels = np.asarray(Image.open(tmp_path / "ground.png").convert("RGB"))
+        assert np.all(pixels[-3:] == pixels[-1, 0]), "the lowest rows are ground"
+        assert tuple(pixels[-1, 0]) != (255, 255, 255)
+        assert tuple(pixels[0, 0]) == (255, 255, 255)
+
+
 def test_a_whole_solution_is_no_frame_and_a_path_has_a_known_end(tmp_path):
     with pytest.raises(ValueError, match=r"frame.position must have shape \(particle, 2\) .* take one frame"):
         draw(film().y)

@@ -68,6 +68,16 @@ class View:
             half = np.full(dim, camera.width / 2) * (1.0 if dim == 3 else np.array([1.0, 0.7]))
         return cls(camera, center, half)
 
+    def filling(self, ax: Any) -> View:
+        """In the plane, the view with its height or width grown to the shape of the axes, so that no strip is left."""
+        if len(self.half) == 3:
+            return self
+        box = ax.get_window_extent()
+        x, y = self.half
+        return dataclasses.replace(
+            self, half=np.array([max(x, y * box.width / box.height), max(y, x * box.height / box.width)])
+        )
+
     def aim(self, ax: Any, position: np.ndarray, alive: np.ndarray, t: float) -> None:
         """Point the axes at the scene."""
         center, camera = self.center, self.camera

@@ -119,7 +119,7 @@ class Film:
         state = jax.tree.map(lambda x: np.asarray(x)[:: self.every], self.solution.y)
         times = np.asarray(self.solution.t)[:: self.every]
         ax = new_axes(state.position.shape[-1], self.look.background, self.size)
-        view = View.of(self.camera, state.position, alive_of(state))
+        view = View.of(self.camera, state.position, alive_of(state)).filling(ax)
         dark = np.mean(colors.to_rgb(self.look.background)) < 0.5
 
         def frames() -> Iterator[None]:

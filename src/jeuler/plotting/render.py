@@ -81,7 +81,7 @@ def draw(
     camera, look = camera or Camera(), look or Look()
     if ax is None:
         ax = new_axes(position.shape[1], look.background)
-    view = View.of(camera, position[None], alive_of(frame)[None])
+    view = View.of(camera, position[None], alive_of(frame)[None]).filling(ax)
     Picture(ax, scene, view, look, frame, t).update(frame, t)
     return ax
 
