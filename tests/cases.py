@@ -63,9 +63,7 @@ def pendulum(t, y, args):
 
 
 PROBLEMS = {
-    "source": Problem(
-        lambda x, y, a: a * x + y / 5, -3.0, 1.0, 5.0, exact=lambda x: 22 * np.exp(x / 5) - 5 * x - 25
-    ),
+    "source": Problem(lambda x, y, a: a * x + y / 5, -3.0, 1.0, 5.0, exact=lambda x: 22 * np.exp(x / 5) - 5 * x - 25),
     "decay": Problem(lambda t, y, k: -k * y, np.array([1.0, 2.0, -3.0]), 0.7, 2.0),
     "oscillator": Problem(oscillator, (1.0, 0.0), (4.0, 0.4), 3.0, exact=oscillator_exact, pair=True),
     "pendulum": Problem(pendulum, (np.array([0.5, 2.0]), np.zeros(2)), 9.81, 2.0, pair=True),
@@ -81,22 +79,113 @@ NET_POSITION = np.array([[0.0, 0.0], [1.1, 0.1], [1.0, 0.9], [-0.1, 1.2]])
 NET_VELOCITY = np.array([[0.0, 0.0], [0.4, -0.3], [0.2, 0.5], [-0.6, 0.1]])
 NET_MASS = np.array([np.inf, 1.0, 2.0, 0.5])
 
+STRAND = [[0, 1, 2, 3]]
+STRAND_POSITION = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 0.8], [0.5, 0.3, 0.9], [0.9, 0.2, 0.7]])
+STRAND_VELOCITY = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 0.2], [0.2, 0.5, -0.1], [-0.6, 0.1, 0.3]])
+STRAND_REST = np.array([[[0.0, 0.0, 0.0], [0.3, 0.1, -0.2], [0.2, 0.4, -0.4], [0.5, 0.3, -0.8]]])
+FLOOR = jeuler.Plane([0.0, 0.4], [0.1, 1.0])
+
 FORCES = {
     "gravity": lambda: jeuler.Gravity([0.3, -9.81]),
     "springs": lambda: jeuler.Springs(NET_EDGES, ks=np.linspace(20.0, 60.0, 5), kd=0.7, rest_length=0.9),
     "springs_without_length": lambda: jeuler.Springs(NET_EDGES, ks=30.0, kd=np.linspace(0.1, 1.0, 5), rest_length=0.0),
     "no_springs": lambda: jeuler.Springs([], ks=30.0, kd=1.0, rest_length=1.0),
+    "linear_drag": lambda: jeuler.LinearDrag(0.4),
     "quadratic_drag": lambda: jeuler.QuadraticDrag(0.3),
+    "wind": lambda: jeuler.LinearDrag(0.4, air=jeuler.Wind([1.0, -0.5])),
+    "gust": lambda: jeuler.QuadraticDrag(0.4, air=jeuler.Gust([3.0, 0.5], period=0.7)),
+    "turbulence": lambda: jeuler.LinearDrag(0.4, air=jeuler.turbulence(dim=2, speed=1.0, size=0.8, time=0.5, modes=4)),
+    "vortex": lambda: jeuler.LinearDrag(0.4, air=jeuler.Vortex([0.4, 0.3], circulation=3.0, core=0.2)),
+    "attractor": lambda: jeuler.PointAttractor([0.3, 2.0], 5.0, softening=0.1),
+    "viscosity": lambda: jeuler.Viscosity(NET_EDGES, np.linspace(0.1, 0.5, 5)),
+    "bending": lambda: jeuler.Bending([[0, 1, 2], [1, 2, 3]], [0.3, 0.5], 0.4),
+    "shape_matching": lambda: jeuler.ShapeMatching(range(4), 1.2 * NET_POSITION[::-1], 5.0, damping=0.4),
+    "penalty_contact": lambda: jeuler.PenaltyContact(FLOOR, ks=40.0, kd=0.2, radius=0.1),
+    "strand_bending": lambda: jeuler.StrandBending(STRAND, STRAND_REST, 3.0, 0.5, 1.0),
+    "strand_core": lambda: jeuler.StrandCore(STRAND, STRAND_REST, 3.0, 0.5, 1.0),
     "function": lambda: lambda t, position, velocity, mass: -0.1 * velocity + 0.2 * jnp.sin(t),
 }
-INTERNAL_FORCES = ("springs", "springs_without_length", "no_springs")  # action equals reaction
+IN_SPACE = ("strand_bending", "strand_core")
+# action equals reaction; and those whose forces have no torque either
+INTERNAL_FORCES = (
+    "springs", "springs_without_length", "no_springs", "viscosity", "bending", "shape_matching", *IN_SPACE,
+)  # fmt: skip
+CENTRAL_FORCES = ("springs", "springs_without_length", "no_springs", "bending", "shape_matching")
+
+
+@dataclasses.dataclass(frozen=True)
+class Effect:
+    """An effect, the fields that it brings into the state, and what else its scene must have."""
+
+    make: Callable
+    fields: frozenset = frozenset()
+    needs: tuple = ()
+
+
+def effect(make, *fields, needs=()):
+    return Effect(make, frozenset(fields), needs)
+
+
+def path(t):
+    return jnp.stack([0.3 * jnp.sin(2 * t), 0.1 * t])[None]
+
+
+SAMPLES = np.array([[[0.0, 0.0]], [[0.1, 0.2]], [[0.3, 0.1]], [[0.2, 0.0]]])
+POOL = ("alive", "births", "missed_births")
+PLACE, SPEED = [0.5, 2.0], [0.1, 0.3]
+LIFE = jeuler.Lifetime(0.5)
+SOLIDS = (FLOOR, jeuler.Sphere([2.0, 2.0], 0.2), jeuler.Box([-2.0, 1.0], 0.3))
 
 EFFECTS = {
-    "prescribed_motion": lambda: jeuler.PrescribedMotion([0], lambda t: jnp.stack([0.3 * jnp.sin(2 * t), 0.1 * t])[None]),
-    "sampled_motion": lambda: jeuler.PrescribedMotion(
-        [0], jeuler.SampledPath([0.0, 0.5, 1.0, 1.5], np.array([[[0.0, 0.0]], [[0.1, 0.2]], [[0.3, 0.1]], [[0.2, 0.0]]]))
+    "prescribed_motion": effect(lambda: jeuler.PrescribedMotion([0], path)),
+    "sampled_motion": effect(
+        lambda: jeuler.PrescribedMotion([0], jeuler.SampledPath([0.0, 0.5, 1.0, 1.5], SAMPLES))
     ),
-}
+    "collisions": effect(lambda: jeuler.Collisions(SOLIDS, radius=0.05, restitution=0.5, friction=0.3)),
+    "colliding_pairs": effect(lambda: jeuler.Collisions(pairs=[(1, 2)], radius=0.2, restitution=0.5)),
+    "speed_limit": effect(lambda: jeuler.SpeedLimit(0.5)),
+    "emitter": effect(lambda: jeuler.Emitter(40.0, PLACE, SPEED, max_births=2), *POOL),
+    "emitter_of_a_disc": effect(
+        lambda: jeuler.Emitter(40.0, jeuler.FromDisc(PLACE, 0.1), jeuler.Cone([0.0, 1.0], 2.0, 0.2)), *POOL
+    ),
+    "emitter_of_a_ball": effect(
+        lambda: jeuler.Emitter(40.0, jeuler.FromSphere(PLACE, 0.1), jeuler.Normal(SPEED, 0.1), color=np.ones(3)),
+        *POOL, "color",
+    ),
+    "emitter_of_a_line": effect(
+        lambda: jeuler.Emitter(
+            40.0, jeuler.FromLine(PLACE, SPEED), jeuler.Uniform(SPEED, PLACE), size=jeuler.Choice([0.1, 0.2])
+        ),
+        *POOL, "size",
+    ),
+    "emitter_of_a_surface": effect(
+        lambda: jeuler.Emitter(40.0, jeuler.FromSurface([PLACE, SPEED, [0.0, 0.0]], [[0, 1, 2]]), SPEED), *POOL
+    ),
+    "lifetime": effect(lambda: jeuler.Lifetime(0.5), "alive", "age"),
+    "death": effect(lambda: jeuler.Death(lambda t, state: state.position[:, 0] > 5.0), "alive"),
+    "death_outside": effect(lambda: jeuler.DeathOutside(-4.0, 4.0), "alive"),
+    "death_on_contact": effect(lambda: jeuler.DeathOnContact(jeuler.Plane([0.0, -3.0], [0.0, 1.0])), "alive"),
+    "color_over_life": effect(lambda: jeuler.OverLife("color", np.eye(3), duration=0.5), "color", needs=(LIFE,)),
+    "opacity_over_life": effect(lambda: jeuler.OverLife("opacity", [1.0, 0.0], duration=0.5), "opacity", needs=(LIFE,)),
+    "size_over_life": effect(lambda: jeuler.OverLife("size", [0.1, 0.2], duration=0.5), "size", needs=(LIFE,)),
+    "shape_over_life": effect(lambda: jeuler.OverLife("shape", [0.0, 1.0], duration=0.5), "shape", needs=(LIFE,)),
+    "heat_over_life": effect(lambda: jeuler.OverLife("heat", [1.0, 0.0], duration=0.5), "heat", needs=(LIFE,)),
+}  # fmt: skip
+
+
+def kinds_in(part):
+    """The names of the public classes in a force or effect, at any depth."""
+    ours = type(part).__module__.startswith("jeuler")
+    children = part if isinstance(part, (tuple, list)) else vars(part).values() if ours else ()
+    return {type(part).__name__}.intersection(jeuler.__all__).union(*map(kinds_in, children))
+
+
+def force_state(name, dtype=jnp.float64):
+    """The state on which a force is tried: four particles, in space for hair."""
+    if name not in IN_SPACE:
+        return net_state(dtype)
+    mass = jnp.asarray([np.inf, 1.0, 2.0, 0.5], dtype)
+    return jeuler.ParticleState(jnp.asarray(STRAND_POSITION, dtype), jnp.asarray(STRAND_VELOCITY, dtype), mass)
 
 
 def net_state(dtype=jnp.float64):

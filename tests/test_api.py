@@ -1,5 +1,6 @@
 """Completeness: every public name is documented, in the README, in the tables; importing stays light."""
 
+import importlib
 import inspect
 import pathlib
 import re
@@ -34,6 +35,16 @@ def test_public_name_has_a_line_in_the_readme(name):
 def test_every_step_has_a_row():
     steps = {name for name in jeuler.__all__ if hasattr(getattr(jeuler, name), "increment")}
     assert steps == {method.step.__name__ for method in cases.METHODS.values()}
+
+
+@pytest.mark.parametrize("room", ["forces", "effects", "colliders"])
+def test_every_force_effect_sampler_and_collider_has_a_row(room):
+    rows = [make() for make in cases.FORCES.values()] + [row.make() for row in cases.EFFECTS.values()]
+    module = importlib.import_module(f"jeuler.{room}")
+    public = {name for name in jeuler.__all__ if inspect.isclass(getattr(jeuler, name)) and hasattr(module, name)}
+    public = {name for name in public if getattr(jeuler, name).__module__.startswith(f"jeuler.{room}")}
+    assert len(public) >= 3
+    assert public <= set().union(*map(cases.kinds_in, rows))
 
 
 def test_public_names_are_sorted_and_exist():

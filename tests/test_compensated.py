@@ -54,9 +54,9 @@ def test_it_survives_jit_and_vmap():
     eager = error(n, True)
     assert eager < 5 * EPS
     assert error(n, True, transform=jax.jit) == eager
-    assert error(
-        n, True, transform=lambda run: lambda y: jax.jit(jax.vmap(run))(jnp.full(3, y))
-    ) == pytest.approx(eager, abs=EPS)
+    assert error(n, True, transform=lambda run: lambda y: jax.jit(jax.vmap(run))(jnp.full(3, y))) == pytest.approx(
+        eager, abs=EPS
+    )
     assert error(n, False) > 20 * eager
 
 
@@ -108,9 +108,7 @@ def test_simulate_has_it_and_only_asks_of_steps_that_can():
     def final(dtype, compensated, step=jeuler.euler_step):
         with precision(dtype):
             scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks=9.0, kd=0.1, rest_length=1.0),))
-            state = jeuler.ParticleState(
-                jnp.array([[0.0], [1.5]], dtype), jnp.zeros((2, 1), dtype), [jnp.inf, 1.0]
-            )
+            state = jeuler.ParticleState(jnp.array([[0.0], [1.5]], dtype), jnp.zeros((2, 1), dtype), [jnp.inf, 1.0])
             run = jeuler.simulate(
                 scene,
                 state,

@@ -88,12 +88,8 @@ def test_neighbours_of_a_solution_run_away_from_it_as_exp():
     t = np.linspace(0.0, 8.0, 9)
     for c in (0.1, -0.1, 0.0):
         slope = c * np.exp(t) + 11 / 32 * np.exp(-t / 3)
-        np.testing.assert_allclose(
-            jax.vmap(lambda t, y: field(t, y, None))(t, exact(c, t)), slope, rtol=1e-12
-        )
-        run = jeuler.solve(
-            field, exact(c, 0.0), dt=1 / 256, num_steps=8 * 256, step=jeuler.rk4_step, save_every=256
-        )
+        np.testing.assert_allclose(jax.vmap(lambda t, y: field(t, y, None))(t, exact(c, t)), slope, rtol=1e-12)
+        run = jeuler.solve(field, exact(c, 0.0), dt=1 / 256, num_steps=8 * 256, step=jeuler.rk4_step, save_every=256)
         np.testing.assert_allclose(run.y, exact(c, t), rtol=1e-5, atol=1e-6)
     run = jeuler.solve(field, exact(0.0, 0.0), dt=1 / 256, num_steps=8 * 256, save_every=256)
     error = np.abs(np.asarray(run.y) - exact(0.0, t))

@@ -20,9 +20,7 @@ START = jnp.array(2.0), jnp.array(0.0)
 
 
 def published(mu, t1):
-    run = solve_ivp(
-        lambda t, y: van_der_pol(t, y, mu), (0, t1), [2.0, 0.0], method="LSODA", rtol=1e-12, atol=1e-13
-    )
+    run = solve_ivp(lambda t, y: van_der_pol(t, y, mu), (0, t1), [2.0, 0.0], method="LSODA", rtol=1e-12, atol=1e-13)
     return run.y[:, -1]
 
 
@@ -94,18 +92,14 @@ def test_linearly_implicit_rows_solve_a_stiff_problem_that_explicit_ones_cannot(
 def test_adaptive_run_meets_its_tolerance_and_agrees_with_lsoda():
     times = [2.0, 5.0, 10.0]
     run = jax.jit(
-        lambda tolerance: solve_adaptive(
-            van_der_pol, START, t1=times, args=3.0, rtol=tolerance, atol=tolerance
-        )
+        lambda tolerance: solve_adaptive(van_der_pol, START, t1=times, args=3.0, rtol=tolerance, atol=tolerance)
     )
     errors = []
     for tolerance in (1e-4, 1e-7, 1e-10):
         found = run(tolerance)
         assert bool(found.finished)
         np.testing.assert_array_equal(found.t, [0.0, *times])
-        errors.append(
-            max(abs(float(found.y[0][i]) - published(3.0, t)[0]) for i, t in enumerate(times, start=1))
-        )
+        errors.append(max(abs(float(found.y[0][i]) - published(3.0, t)[0]) for i, t in enumerate(times, start=1)))
     assert errors[0] < 1e-2
     assert errors[1] < 1e-5
     assert errors[2] < 1e-8
@@ -113,9 +107,7 @@ def test_adaptive_run_meets_its_tolerance_and_agrees_with_lsoda():
 
 def test_derivatives_of_an_adaptive_run_agree_with_diffrax_in_both_modes():
     def final(mu):
-        return solve_adaptive(van_der_pol, START, t1=4.0, args=mu, rtol=1e-10, atol=1e-10, max_steps=256).y[
-            0
-        ][-1]
+        return solve_adaptive(van_der_pol, START, t1=4.0, args=mu, rtol=1e-10, atol=1e-10, max_steps=256).y[0][-1]
 
     def final_diffrax(mu):
         control = diffrax.PIDController(rtol=1e-11, atol=1e-11)
@@ -138,18 +130,14 @@ def test_derivatives_of_an_adaptive_run_agree_with_diffrax_in_both_modes():
     reverse = jax.jit(jax.grad(final))(2.0)
     expected = jax.jit(lambda mu: jax.jvp(final_diffrax, (mu,), (1.0,))[1])(2.0)
     assert float(reverse) == pytest.approx(float(expected), rel=1e-6)
-    assert float(jax.jit(lambda mu: jax.jvp(final, (mu,), (1.0,))[1])(2.0)) == pytest.approx(
-        float(reverse), rel=1e-10
-    )
+    assert float(jax.jit(lambda mu: jax.jvp(final, (mu,), (1.0,))[1])(2.0)) == pytest.approx(float(reverse), rel=1e-10)
 
 
 def test_adaptive_run_says_when_it_did_not_finish_and_vmaps():
     short = solve_adaptive(van_der_pol, START, t1=10.0, args=1.0, max_steps=3)
     assert not bool(short.finished)
     assert np.isnan(short.y[0][-1])
-    batch = jax.vmap(lambda mu: solve_adaptive(van_der_pol, START, t1=1.0, args=mu).y[0][-1])(
-        jnp.array([0.5, 5.0])
-    )
+    batch = jax.vmap(lambda mu: solve_adaptive(van_der_pol, START, t1=1.0, args=mu).y[0][-1])(jnp.array([0.5, 5.0]))
     np.testing.assert_allclose(batch, [published(0.5, 1.0)[0], published(5.0, 1.0)[0]], rtol=1e-5)
 
 

@@ -45,7 +45,9 @@ def test_built_in_example(folder, capsys):
     assert sorted(path.name for path in folder.iterdir()) == ["jeuler_fit.png", "out.json"]
 
 
-@pytest.mark.parametrize(("drag", "squared", "tolerance", "rms"), [(None, 22.9, 0.3, 2.1e-3), ("quadratic", 22.6, 0.2, 1.3e-3)])
+@pytest.mark.parametrize(
+    ("drag", "squared", "tolerance", "rms"), [(None, 22.9, 0.3, 2.1e-3), ("quadratic", 22.6, 0.2, 1.3e-3)]
+)
 def test_sphere_in_water(shared, folder, drag, squared, tolerance, rms):
     arguments = ["fit", str(shared / "data" / "sphere_in_water.csv"), "--from", "0.75", "--json", "out.json"]
     assert main(arguments + (["--drag", drag] if drag else [])) == 0
@@ -65,13 +67,14 @@ def test_two_coupled_particles(folder, capsys):
     scene = jeuler.Scene(
         forces=(jeuler.Springs([[0, 2]], ks[0], kd[0], 0.0), jeuler.Springs([[0, 1]], ks[1], kd[1], 0.5))
     )
-    state = jeuler.ParticleState(
-        [[0.05, 0.02], [0.6, 0.1], [0.0, 0.0]], jnp.zeros((3, 2)), mass=[0.2, 0.3, jnp.inf]
-    )
+    state = jeuler.ParticleState([[0.05, 0.02], [0.6, 0.1], [0.0, 0.0]], jnp.zeros((3, 2)), mass=[0.2, 0.3, jnp.inf])
     run = jeuler.simulate(scene, state, dt=1e-3, num_steps=3000, step=jeuler.rk4_step, save_every=25)
     table = np.column_stack([run.t, *np.asarray(run.y.position[:, :2]).reshape(len(run.t), 4).T])
     np.savetxt("two.tsv", table, delimiter="\t", header="t\tx1\ty1\tx2\ty2", comments="")
-    assert main(["fit", "two.tsv", "--mass", "0.2,0.3", "--edges", "1-anchor,1-2", "--json", "o.json", "--plot", "o.png"]) == 0
+    assert (
+        main(["fit", "two.tsv", "--mass", "0.2,0.3", "--edges", "1-anchor,1-2", "--json", "o.json", "--plot", "o.png"])
+        == 0
+    )
     springs = json.loads((folder / "o.json").read_text())["springs"]
     assert [spring["edge"] for spring in springs] == ["1-anchor", "1-2"]
     np.testing.assert_allclose([spring["ks"] for spring in springs], ks, rtol=0.01)
@@ -88,7 +91,10 @@ def test_two_coupled_particles(folder, capsys):
         (["fit", "good.csv", "--mass", "-1"], "--mass must be one positive number of kg or 1"),
         (["fit", "good.csv", "--mass", "1,2,3"], "--mass must be one positive number of kg or 1"),
         (["fit", "good.csv", "--mass", "heavy"], "--mass must be numbers separated by commas, got 'heavy'"),
-        (["fit", "good.csv", "--edges", "1-2"], "--edges must be like 1-2,2-anchor with particles from 1 to 1, got '1-2'"),
+        (
+            ["fit", "good.csv", "--edges", "1-2"],
+            "--edges must be like 1-2,2-anchor with particles from 1 to 1, got '1-2'",
+        ),
         (["fit", "good.csv", "--start", "ks=-4"], "--start must be like ks=20,kd=0.3"),
         (["fit", "good.csv", "--from", "100"], "0 rows between --from and --to.* the times run from 0 to"),
         (["fit", "good.csv", "--columns", "y"], "no column 'y', the columns are x"),

@@ -129,9 +129,7 @@ def test_few_steps(num_steps):
 def test_checkpoint_changes_nothing_but_memory(checkpoint, save_every):
     def loss(k):
         return jnp.sum(
-            jeuler.solve(
-                growth, 1.0, dt=0.1, num_steps=60, args=k, save_every=save_every, checkpoint=checkpoint
-            ).y
+            jeuler.solve(growth, 1.0, dt=0.1, num_steps=60, args=k, save_every=save_every, checkpoint=checkpoint).y
         )
 
     value, slope = jax.jit(jax.value_and_grad(loss))(0.3)

@@ -62,10 +62,7 @@ def test_decay_has_the_real_stability_interval(step, interval):
 def spring_net(kd, side=3):
     index = np.arange(side * side).reshape(side, side)
     edges = np.concatenate(
-        [
-            np.stack([a.ravel(), b.ravel()], 1)
-            for a, b in ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))
-        ]
+        [np.stack([a.ravel(), b.ravel()], 1) for a, b in ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))]
     )
     position = np.stack(np.divmod(np.arange(side * side), side), axis=1).astype(float)
     position += 0.1 * np.sin(7 * position[:, ::-1])
@@ -117,9 +114,7 @@ def test_runs_blow_up_within_five_percent_of_the_limit(number):
     limit = stability_limit(f, 0.0, y, args, step=step)
     leaves, tree = jax.tree.flatten(y)
     random = np.random.default_rng(number)
-    small = jax.tree.unflatten(
-        tree, [1e-8 * jnp.asarray(random.standard_normal(np.shape(leaf))) for leaf in leaves]
-    )
+    small = jax.tree.unflatten(tree, [1e-8 * jnp.asarray(random.standard_normal(np.shape(leaf))) for leaf in leaves])
     rest = jax.tree.map(jnp.zeros_like, y)
     if f is net_field:  # start at rest: a net that can turn about its pin would drift away with a velocity
         rest, small = y, (small[0], jnp.zeros_like(small[1]))
@@ -167,9 +162,7 @@ def test_a_step_of_ones_own_and_complex_states():
 def test_float32_data_have_the_same_limit():
     y = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rest)
     expected = stability_limit(net_field, 0.0, rest, (net, net_mass))
-    assert stability_limit(net_field, 0.0, y, (net, net_mass), growing="skip") == pytest.approx(
-        expected, rel=1e-3
-    )
+    assert stability_limit(net_field, 0.0, y, (net, net_mass), growing="skip") == pytest.approx(expected, rel=1e-3)
 
 
 def test_bad_input_is_told():

@@ -8,6 +8,7 @@ from jeuler import Gravity, Scene, Springs, simulate
 from jeuler.effects import Cone, Emitter, FromDisc, Lifetime, OverLife, Uniform
 from jeuler.forces import LinearDrag
 from jeuler.state import empty_pool
+from jeuler.window import ladder
 
 JET = Emitter(
     200.0, FromDisc([0.0, 0.0], 0.1), Cone([0.0, 1.0], Uniform(4.0, 6.0), 0.2), lifetime=Uniform(0.1, 0.4),
@@ -47,12 +48,32 @@ def test_the_gradient_flows_through_windows():
         assert np.allclose(a, b, rtol=1e-10, atol=1e-14)
 
 
+def test_sizes_are_chosen_for_a_pool_of_any_capacity(monkeypatch):
+    assert np.allclose(ladder(200_000)[-3:], (70_710, 100_000, 141_421), atol=1)
+    assert ladder(200_000)[0] < 5000
+    assert ladder(1000) == (), "a small pool is one window"
+    monkeypatch.setattr("jeuler.window.SMALLEST", 20)
+
+    def end(windows):
+        return simulate(
+            SCENE, empty_pool(200, 2), dt=0.01, num_steps=20, save_every=5, key=jax.random.key(0), windows=windows
+        ).y  # fmt: skip
+
+    whole, chosen = end(()), end("auto")
+    assert np.allclose(whole.position, chosen.position, rtol=1e-13, atol=1e-15)
+    assert np.array_equal(whole.alive, chosen.alive)
+    program = str(jax.make_jaxpr(lambda: end("auto"))())
+    assert "cond" in program, "the run is in windows"
+
+
 def test_what_cannot_run_in_windows_is_refused():
     def run(scene, windows=(4,), pool=None):
         simulate(scene, pool or empty_pool(9, 2), dt=0.1, num_steps=1, key=jax.random.key(0), windows=windows)
 
     with pytest.raises(ValueError, match=r"increasing order, got \(8, 4\)"):
         run(SCENE, (8, 4))
+    with pytest.raises(ValueError, match=r'windows must be "auto" or sizes'):
+        run(SCENE, "small")
     unbounded = Emitter(1.0, [0.0, 0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match=r"Emitter.max_births = None; pass max_births"):
         run(Scene(effects=(unbounded,)))

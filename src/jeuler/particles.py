@@ -153,7 +153,7 @@ def simulate(
     key: Array | None = None,
     checkpoint: Checkpoint = None,
     compensated: bool = False,
-    windows: tuple[int, ...] = (),
+    windows: tuple[int, ...] | str = (),
 ) -> Solution:
     """Run a scene: num_steps steps of its equation of motion and its effects, in one ``lax.scan``.
 
@@ -174,9 +174,9 @@ def simulate(
       key: a ``jax.random.key`` for effects that draw random numbers; each gets its own at each step.
       checkpoint: memory of reverse mode, as in `solve`; "reversible" for scenes of forces alone.
       compensated: compensated sums of position and velocity, as in `solve`.
-      windows: sizes in increasing order. Between two saved states the run works on the smallest of these many first
-        slots that holds all that live or can be born, so that a large pool costs what is alive. Under ``vmap`` all
-        sizes run: leave it empty there.
+      windows: sizes in increasing order, or "auto" for a ladder of them. Between two saved states the run works on
+        the smallest of these many first slots that holds all that live or can be born, so that a large pool costs
+        what is alive. Each size is compiled. Under ``vmap`` all sizes run: leave it empty there.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -199,8 +199,8 @@ def simulate(
     _check.same_form("the sum of forces", motion, form)
     _check_effects(scene, state, grid, key)
     advance = advance_by(step if hasattr(step, "increment") else _on_arrays(step), compensated=compensated)
-    # a pool's springs change with who is alive, so there is nothing to prepare
-    prepared = scene if state.alive is not None else scene.prepare(len(state.position), motion[0].dtype)
+    # each window would need springs laid out for its own size
+    prepared = scene if windows else scene.prepare(len(state.position), motion[0].dtype)
     early = any(declared(effect, "before_motion", False) for effect in scene.effects)
 
     def field(t, motion, attributes):  # on components, as they are carried from step to step

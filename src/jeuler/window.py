@@ -21,11 +21,24 @@ PyTree = Any
 Run = Callable[[PyTree], PyTree]
 
 
-def in_windows(sizes: tuple[int, ...], scene: Any, state: Any, steps: int) -> Callable[[Run, PyTree], PyTree]:
+SMALLEST, RATIO, MOST = 1024, 2**0.5, 12  # of the windows that are chosen for the person
+
+
+def ladder(capacity: int) -> tuple[int, ...]:
+    """Sizes from the capacity down, each smaller by the same ratio; every size is compiled, so there are few.
+
+        capacity / RATIO^k,   k = 1 .. MOST, not below SMALLEST
+    """
+    sizes = (int(capacity / RATIO**k) for k in range(MOST, 0, -1))
+    return tuple(size for size in sizes if size >= SMALLEST)
+
+
+def in_windows(sizes: tuple[int, ...] | str, scene: Any, state: Any, steps: int) -> Callable[[Run, PyTree], PyTree]:
     """A function ``within(run, carry)``: ``steps`` steps of the run on the smallest window that is large enough."""
     if not sizes:
         return lambda run, carry: run(carry)
     capacity = len(state.position)
+    sizes = ladder(capacity) if sizes == "auto" else sizes
     sizes = (*checked_sizes(sizes, capacity, scene, state), capacity)
     births = steps * sum(effect.max_births for effect in scene.effects if hasattr(effect, "max_births"))
 
@@ -52,8 +65,10 @@ def on_first(size: int, capacity: int, run: Run) -> Run:
     return run if size == capacity else narrow
 
 
-def checked_sizes(sizes: tuple[int, ...], capacity: int, scene: Any, state: Any) -> tuple[int, ...]:
+def checked_sizes(sizes: tuple[int, ...] | str, capacity: int, scene: Any, state: Any) -> tuple[int, ...]:
     """The sizes, if they increase and every force and effect can work on a part of the slots; or one ValueError."""
+    if isinstance(sizes, str):
+        raise ValueError(f'windows must be "auto" or sizes in increasing order, got {sizes!r}')
     sizes = tuple(sizes)
     if any(not isinstance(size, int) or size < 1 for size in sizes) or list(sizes) != sorted(set(sizes)):
         raise ValueError(f"windows must be positive integers in increasing order, got {sizes}")

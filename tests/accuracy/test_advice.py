@@ -13,10 +13,7 @@ from jeuler.accuracy.pilot import Pilot
 
 NAMES = {name: getattr(jnp, name) for name in ("sin", "cos", "exp", "sqrt", "pi", "where", "floor", "sign")}
 NAMES |= {"range": range, "sum": sum, "abs": abs}
-FAST = [
-    f"DETEST_nonstiff_{name}"
-    for name in ("A1", "A3", "A4", "B1", "B3", "B5", "C1", "D1", "E2", "E5", "F1", "F5")
-]
+FAST = [f"DETEST_nonstiff_{name}" for name in ("A1", "A3", "A4", "B1", "B3", "B5", "C1", "D1", "E2", "E5", "F1", "F5")]
 FAST += ["DETEST_stiff_B5", "DETEST_stiff_E2", "LORENZ_111_t10"]
 
 
@@ -61,13 +58,9 @@ def test_other_steps_are_advised_too(step):
 def test_symplectic_step_and_absolute_error():
     field = lambda t, y, ks: (y[1], -ks * y[0])  # noqa: E731
     y0 = jnp.array(100.0), jnp.array(0.0)
-    advice = advise_step(
-        field, y0, t1=3.0, error=0.5, args=9.0, step=jeuler.symplectic_euler_step, relative=False
-    )
+    advice = advise_step(field, y0, t1=3.0, error=0.5, args=9.0, step=jeuler.symplectic_euler_step, relative=False)
     assert advice.stability_limit == pytest.approx(2 / 3, rel=1e-3)
-    run = jeuler.solve(
-        field, y0, dt=advice.dt, num_steps=advice.num_steps, args=9.0, step=jeuler.symplectic_euler_step
-    )
+    run = jeuler.solve(field, y0, dt=advice.dt, num_steps=advice.num_steps, args=9.0, step=jeuler.symplectic_euler_step)
     error = math.hypot(run.y[0][-1] - 100 * math.cos(9), run.y[1][-1] + 300 * math.sin(9))
     assert 0.5 / 3 < error < 0.5
 

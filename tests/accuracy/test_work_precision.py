@@ -74,9 +74,7 @@ def test_every_method_has_every_dt_in_every_precision(table):
     assert len(table.rows) == 2 * (6 * 2 + 2)  # two methods can also choose their own steps
     assert all(set(row) == set(EMPTY_ROW) for row in table.rows)
     assert all(row["reason"] == "" and len(row["run_seconds"]) == 2 for row in table.rows)
-    assert all(
-        row["run_seconds_min"] == min(row["run_seconds"]) > 0 < row["compile_seconds"] for row in table.rows
-    )
+    assert all(row["run_seconds_min"] == min(row["run_seconds"]) > 0 < row["compile_seconds"] for row in table.rows)
 
 
 def test_evaluations_are_counted(table):
@@ -111,9 +109,7 @@ def test_the_table_can_be_written_read_and_drawn(table, tmp_path):
         read = list(csv.DictReader(file))
     assert [row["method"] for row in read] == [row["method"] for row in table.rows]
     assert [float(row["error_final"]) for row in read] == [row["error_final"] for row in table.rows]
-    assert [tuple(map(float, row["run_seconds"].split())) for row in read] == [
-        r["run_seconds"] for r in table.rows
-    ]
+    assert [tuple(map(float, row["run_seconds"].split())) for row in read] == [r["run_seconds"] for r in table.rows]
     text = table.to_markdown()
     assert len(text.splitlines()) == 2 + 6 * 2 + 2
     assert "float32" in text.splitlines()[0]
@@ -128,9 +124,7 @@ def test_the_table_can_be_written_read_and_drawn(table, tmp_path):
 
 
 def test_without_a_reference_diffrax_gives_one_and_says_how_far_to_trust_it():
-    table = work_precision(
-        oscillator, (1.0, 0.0), t1=1.0, dts=[0.1], steps=[jeuler.rk4_step], args=4.0, repeats=1
-    )
+    table = work_precision(oscillator, (1.0, 0.0), t1=1.0, dts=[0.1], steps=[jeuler.rk4_step], args=4.0, repeats=1)
     (row,) = table.rows
     assert row["method"] == "rk4"
     run = jeuler.solve(oscillator, (1.0, 0.0), dt=0.1, num_steps=10, args=4.0, step=jeuler.rk4_step)

@@ -84,8 +84,10 @@ def exact(times, kd=KD):
     decay = kd / MASS / 2
     omega = np.sqrt(KS / MASS - decay**2)
     a = X0 - ANCHOR - LENGTH
-    return ANCHOR + LENGTH + np.exp(-decay * times) * (
-        a * np.cos(omega * times) + (V0 + decay * a) / omega * np.sin(omega * times)
+    return (
+        ANCHOR
+        + LENGTH
+        + np.exp(-decay * times) * (a * np.cos(omega * times) + (V0 + decay * a) / omega * np.sin(omega * times))
     )
 
 
@@ -133,9 +135,7 @@ def test_times_off_the_grid_and_missing_cells(random):
 
 def test_gradient_descent_by_optax():
     scene, state = single(ks=6.0, kd=0.8)
-    found = jeuler.fit_springs(
-        scene, state, TIMES, observed(), dt=0.04, optimizer=optax.adam(0.05), max_iterations=300
-    )
+    found = jeuler.fit_springs(scene, state, TIMES, observed(), dt=0.04, optimizer=optax.adam(0.05), max_iterations=300)
     np.testing.assert_allclose((found.ks, found.kd), (KS, KD), rtol=1e-2)
     assert found.history[-1] < 1e-4 * found.history[0]
 

@@ -89,12 +89,7 @@ def test_each_layout_is_the_incidence_matrix(name, random, monkeypatch):
     x, e = random.normal(size=PARTICLES), random.normal(size=len(edges)) ** 2
     for layout in (kind(edges, np.arange(len(edges)), PARTICLES) for kind in (Rows, Pairs)):
         total = layout.accumulate(
-            [
-                w * d
-                for w, d in zip(
-                    layout.to_slots(jnp.asarray(e)), layout.difference(jnp.asarray(x)), strict=True
-                )
-            ]
+            [w * d for w, d in zip(layout.to_slots(jnp.asarray(e)), layout.difference(jnp.asarray(x)), strict=True)]
         )
         check_equal(total, b.T @ (e * (b @ x)), 1e-14)
         held = np.concatenate([slots.ravel() for slots in layout.slot_edges])
@@ -151,9 +146,7 @@ def test_every_nesting_of_derivatives_equals_autodiff_of_the_plain_formula(name,
                 "reverse over reverse": jax.grad(
                     lambda *a: sum(map(jnp.vdot, slope(*a), direction)), argnums=everything
                 )(*args),
-                "reverse over forward": jax.grad(lambda *a: jnp.sum(along(*a) ** 2), argnums=everything)(
-                    *args
-                ),
+                "reverse over forward": jax.grad(lambda *a: jnp.sum(along(*a) ** 2), argnums=everything)(*args),
                 "vmap of reverse": jax.vmap(slope, in_axes=axes)(*batched),
                 "reverse of vmap": jax.grad(
                     lambda *a: jnp.sum(jax.vmap(force, in_axes=axes)(*a) ** 2), argnums=everything
@@ -239,10 +232,7 @@ def test_the_program_does_not_grow_with_the_number_of_springs():
             return jeuler.Springs(edges, 1.0, 1.0, 1.0)(0.0, position, position, 1.0)
 
         return (
-            jax.jit(jax.grad(lambda p: jnp.sum(force(p))))
-            .lower(jnp.ones((particles, 3)))
-            .as_text()
-            .count("stablehlo.")
+            jax.jit(jax.grad(lambda p: jnp.sum(force(p)))).lower(jnp.ones((particles, 3))).as_text().count("stablehlo.")
         )
 
     assert equations(cloth(40), 1600) == equations(cloth(10), 100)
@@ -279,9 +269,7 @@ def test_coincident_ends_are_finite_and_without_rest_length_linear(name, dtype):
     def force(position, rest_length):
         return jeuler.Springs(edges, 7.0, 0.5, rest_length)(0.0, position, velocity, 1.0)
 
-    jacobian, second = jax.jit(lambda p: (jax.jacfwd(force)(p, 0.0), jax.jacfwd(jax.jacrev(force))(p, 0.0)))(
-        position
-    )
+    jacobian, second = jax.jit(lambda p: (jax.jacfwd(force)(p, 0.0), jax.jacfwd(jax.jacrev(force))(p, 0.0)))(position)
     b = incidence_matrix(edges, PARTICLES)
     laplacian = np.einsum("ij,kl->ikjl", -7.0 * b.T @ b, np.eye(2))
     assert force(position, 1.0).dtype == dtype

@@ -38,32 +38,6 @@ def cloud(random):
     return jnp.asarray(random.normal(size=(7, 3))), jnp.asarray(random.normal(size=(7, 3)))
 
 
-INTERNAL = {
-    "viscosity": Viscosity([[0, 1], [1, 2], [2, 6], [0, 5]], [1.0, 2.0, 3.0, 0.5]),
-    "bending": Bending([[0, 1, 2], [1, 2, 3], [4, 5, 6]], [1.0, 2.0, 3.0], [0.0, 0.5, 1.0]),
-    "shape matching": ShapeMatching([0, 2, 3, 5], np.random.default_rng(1).normal(size=(4, 3)), 5.0, damping=2.0),
-    "strand core": StrandCore(
-        [[0, 1, 2, 3], [3, 4, 5, 6]], np.random.default_rng(2).normal(size=(2, 4, 3)), 3.0, 0.5, 1.0
-    ),
-    "strand bending": StrandBending([[0, 1, 2, 3]], np.random.default_rng(3).normal(size=(1, 4, 3)), 3.0, 0.5, 1.0),
-}
-
-
-@pytest.mark.parametrize("name", INTERNAL)
-def test_internal_forces_sum_to_zero_and_have_finite_gradients(name, cloud):
-    p, v = cloud
-    force = INTERNAL[name]
-    f = at(force, p, v)
-    assert f.shape == p.shape
-    assert np.allclose(f.sum(axis=0), 0, atol=1e-12)
-    if name in ("bending", "shape matching"):
-        assert np.allclose(jnp.cross(p, f).sum(axis=0), 0, atol=1e-12), "no torque"
-    shifted = at(force, p + 3.0, v + 2.0)
-    assert np.allclose(shifted, f, atol=1e-9), "only differences count"
-    gradient = jax.jit(jax.grad(lambda force, p: jnp.sum(force(0.0, p, v, ONE) ** 2), argnums=(0, 1)))(force, p)
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
-
-
 def rotation(random, dim=3):
     q, _ = np.linalg.qr(random.normal(size=(dim, dim)))
     return jnp.asarray(q * np.sign(np.linalg.det(q)))

@@ -1,9 +1,13 @@
 """Pictures and films: what is drawn is what the state says."""
 
+import shutil
+import subprocess
+
 import matplotlib
 
 matplotlib.use("Agg")
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,8 +18,10 @@ from PIL import Image
 from jeuler import ParticleState, Scene, Solution, Springs
 from jeuler.colliders import Box, Plane, Sphere
 from jeuler.effects.collisions import Collisions
-from jeuler.plotting.render import Camera, animate, draw, new_axes
-from jeuler.plotting.solids import in_sight
+from jeuler.plotting import Camera, Look, animate, draw
+from jeuler.plotting.camera import View, new_axes
+from jeuler.plotting.render import save_picture
+from jeuler.plotting.solids import draw_colliders, in_sight
 
 FRAMES = 4
 
@@ -96,12 +102,75 @@ def test_a_film_is_written_as_gif_and_html_and_shown_in_a_notebook(tmp_path):
 
 
 def test_mp4_needs_ffmpeg_and_says_so(tmp_path, monkeypatch):
-    if animation.FFMpegWriter.isAvailable():
-        animate(film(), path=tmp_path / "film.mp4", progress=False)
-        assert (tmp_path / "film.mp4").stat().st_size > 1000
     monkeypatch.setattr(animation.FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
     with pytest.raises(RuntimeError, match=r"film.mp4 needs the program ffmpeg.*write film.gif or film.html"):
         animate(film(), path=tmp_path / "film.mp4", progress=False)
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="writes MP4, which needs ffmpeg on the PATH")
+def test_the_frames_of_an_mp4_are_those_of_the_film(tmp_path):
+    animate(film(), path=tmp_path / "film.mp4", camera=Camera(width=3.0), progress=False)
+    subprocess.run(["ffmpeg", "-v", "error", "-i", tmp_path / "film.mp4", tmp_path / "frame%d.png"], check=True)
+    assert len(list(tmp_path.glob("frame*.png"))) == FRAMES
+    save_picture(
+        tmp_path / "expected.png", jax.tree.map(lambda x: x[2], film().y), camera=Camera([0.5, 0.5], width=3.0)
+    )
+    found, expected = (
+        np.asarray(Image.open(tmp_path / f"{n}.png").convert("L"), float) for n in ("frame3", "expected")
+    )
+    assert expected.min() < 150, "there are particles"
+    assert np.abs(found - expected).mean() < 1, "but for the losses of the codec"
+
+
+def test_a_player_holds_every_frame_of_a_large_film(monkeypatch):
+    """Matplotlib drops the frames beyond its limit of megabytes with no more than a line in the log."""
+    monkeypatch.setitem(plt.rcParams, "animation.embed_limit", 1e-3)
+    assert animate(film(), progress=False)._repr_html_().count("data:image/png;base64") == FRAMES
+
+
+def test_a_title_is_read_on_any_background():
+    for background, color in (("white", "black"), ("#10151f", "white")):
+        figure, pictures = animate(film(), look=Look(background), title="t = {t} s", progress=False)._draw_all()
+        list(pictures)
+        assert (figure._suptitle.get_text(), figure._suptitle.get_color()) == ("t = 0.30 s", color)
+
+
+def test_springs_take_the_colour_of_their_particles_or_are_not_drawn():
+    scene = Scene((Springs([[0, 1], [1, 2]], 1.0, 0.0, 1.0),))
+    frame = state(3, color=[[1.0, 0, 0], [0, 0, 1.0], [0, 0, 1.0]])
+    lines = draw(frame, scene, look=Look(links="color", particles=False)).collections
+    assert len(lines) == 1, "and no particles"
+    assert sorted(lines[0].get_colors().tolist()) == [[0, 0, 1, 1], [0.5, 0, 0.5, 1]]
+    assert len(draw(frame, scene, look=Look(links=None)).collections) == 1
+    with pytest.raises(ValueError, match=r'Look.links must be "strain", "color" or None, got \'none\''):
+        Look(links="none")
+
+
+def test_faces_are_lit_and_those_behind_a_solid_are_left_out():
+    corners = np.array([[0.0, -1, -1], [0, 1, -1], [0, 0, 1]])
+    position = np.concatenate([corners + np.array([3.0, 0, 0]), 0.5 * corners - [3.0, 0, 0], corners - [6.0, 0, 5.0]])
+    frame = ParticleState(position, 0 * position, color=np.tile([1.0, 0.5, 0.0], (9, 1)))
+    scene = Scene(effects=(Collisions((Sphere([0.0, 0.0, 0.0], 2.0),)),))
+    look = Look(faces=[[0, 1, 2], [3, 4, 5], [6, 7, 8]], particles=False)
+    ax = draw(frame, scene, look=look, camera=Camera([0.0] * 3, 20.0, azimuth=0.0, elevation=0.0))
+    faces = next(c for c in ax.collections if c.get_zorder() == 1.5)
+    assert len(faces.get_facecolor()) == 2
+    assert np.allclose(faces.get_facecolor()[:, 0] / faces.get_facecolor()[:, 1], 2), "a shade of their own colour"
+    with pytest.raises(ValueError, match=r"Look.faces must have shape \(face, 3\)"):
+        Look(faces=[0, 1, 2])
+
+
+def test_the_ground_is_drawn_first_and_what_is_near_last():
+    solids = (Sphere([5.0, 0.0, 0.5], 0.5), Box([-5.0, 0.0, 0.5], 0.5), Plane([0.0] * 3, [0.0, 0.0, 1.0]))
+    for azimuth, nearest in ((0.0, 1), (180.0, 0)):
+        view = View.of(Camera([0.0] * 3, 20.0, azimuth=azimuth), np.zeros((1, 1, 3)), np.ones((1, 1), bool))
+        ax = new_axes(3, "white")
+        artists = draw_colliders(ax, list(solids), 0.0, view)
+        ground, *others = artists
+        assert ground.get_zorder() < others[0].get_zorder() < others[1].get_zorder()
+        faces = [len(artist.get_facecolor()) for artist in others]
+        assert min(faces) == 3, "the box shows three sides"
+        assert np.argmax(faces) == nearest, "the ball is in front from +x, the box from -x"
 
 
 def test_the_camera_follows():
@@ -110,6 +179,18 @@ def test_the_camera_follows():
     assert np.allclose(np.mean(followed.get_xlim()), frame.position[2, 0])
     mean = draw(frame, camera=Camera(width=1.0, follow="mean"))
     assert np.allclose(np.mean(mean.get_ylim()), frame.position[:, 1].mean())
+
+
+def test_the_ground_fills_the_picture_to_its_edges(tmp_path):
+    """Whatever the shape of the cloud, and of the picture."""
+    frame = ParticleState([[0.0, 0.0], [0.1, 3.0]], np.zeros((2, 2)))
+    ground = Scene(effects=(Collisions((Plane([0.0, 1.0], [0.0, 1.0]),)),))
+    for size in ((6.0, 4.5), (3.0, 6.0)):
+        save_picture(tmp_path / "ground.png", frame, ground, size=size)
+        pixels = np.asarray(Image.open(tmp_path / "ground.png").convert("RGB"))
+        assert np.all(pixels[-3:] == pixels[-1, 0]), "the lowest rows are ground"
+        assert tuple(pixels[-1, 0]) != (255, 255, 255)
+        assert tuple(pixels[0, 0]) == (255, 255, 255)
 
 
 def test_a_whole_solution_is_no_frame_and_a_path_has_a_known_end(tmp_path):

@@ -80,11 +80,7 @@ def test_stability_regions_have_their_extent_and_the_eigenvalues_on_top():
     )
     dots = drawn.lines[-1]
     np.testing.assert_allclose(dots.get_xdata() + 1j * dots.get_ydata(), [-0.5 + 1j, -0.5 - 1j])
-    borders = [
-        c
-        for c in drawn.collections
-        if len(c.get_paths()) and c.get_linewidth().size and len(c.get_edgecolor())
-    ]
+    borders = [c for c in drawn.collections if len(c.get_paths()) and c.get_linewidth().size and len(c.get_edgecolor())]
     left = [min(path.vertices[:, 0].min() for path in c.get_paths() if len(path.vertices)) for c in borders]
     assert min(left) == pytest.approx(-2.785, abs=0.02)
     assert any(x == pytest.approx(-2.0, abs=0.02) for x in left)

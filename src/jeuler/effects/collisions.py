@@ -32,6 +32,7 @@ class Path(NamedTuple):
     drift: Array  # (particle, dim), the step's own displacement
     dv: Array  # (particle, dim), what forces added to the velocity
     jump: Array  # (particle, dim), what impacts added to it
+    flying: Array  # (particle,), whether something may be in the way
 
     def displacement(self, dt: Any) -> Array:
         return self.drift + dt * self.jump
@@ -101,7 +102,7 @@ class Collisions:
         x, v = previous.position, previous.velocity
         here = _Step(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
         zero = jnp.zeros(len(x), x.dtype)
-        path = Path(zero, x, state.position - x, state.velocity - v, jnp.zeros_like(v))
+        path = Path(zero, x, state.position - x, state.velocity - v, jnp.zeros_like(v), here.inverse_mass > 0)
         path, _ = lax.scan(lambda path, _: (here.next_impact(path), None), path, length=self.max_bounces)
         position, velocity = here.rest(path, state.velocity + path.jump)
         return dataclasses.replace(state, position=position, velocity=velocity)
@@ -181,6 +182,7 @@ class _Step:
             s=jnp.where(done, s, path.s),
             x=jnp.where(done[:, None], x, path.x),
             jump=path.jump + change,
+            flying=jnp.isfinite(first),  # who met nothing flies on as before, and need not be searched again
         )
 
     def time_of_impact(self, collider: Collider, path: Path) -> Array:
@@ -201,7 +203,7 @@ class _Step:
 
             def far(state):
                 s, distance, n = state
-                return (distance > 1e-3 * stride) & (s <= 1) & (n < MAX_STRIDES)
+                return path.flying & (distance > 1e-3 * stride) & (s <= 1) & (n < MAX_STRIDES)
 
             def advance(state):
                 s, distance, n = state
@@ -233,7 +235,7 @@ class _Step:
         s, (touching, inside, meeting) = root(gap, path.s, solve, tangent_solve)
         at_once = jnp.where(inside, path.s, lax.stop_gradient(path.s - s) + s)  # value path.s, slope of the root
         s = jnp.where(touching, at_once, jnp.where(meeting, s, jnp.inf))
-        return jnp.where(self.inverse_mass > 0, s, jnp.inf)
+        return jnp.where(path.flying & (self.inverse_mass > 0), s, jnp.inf)
 
     def time_of_meeting(self, path: Path) -> Array:
         """When the two balls of each pair meet next, a part of the step, inf where they do not; (pair,)."""

@@ -111,7 +111,8 @@ class Springs:
         step."""
         layouts = self.edges.layouts(particles)
         parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
-        return PreparedSprings(layouts, *([layout.to_slots(x) for layout in layouts] for x in parameters))
+        slots = ([layout.to_slots(x) for layout in layouts] for x in parameters)
+        return PreparedSprings(self.edges, layouts, *slots)
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks (r - L)^2 / 2, J."""
@@ -140,11 +141,12 @@ class Springs:
             _check.not_negative(f"Springs.{name}", getattr(self, name), unit)
 
 
-@_tree.component(static=("layouts",))
+@_tree.component(static=("edges", "layouts"))
 class PreparedSprings:
     """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and
     group."""
 
+    edges: Topology
     layouts: tuple[Layout, ...]
     ks: Any
     kd: Any
@@ -160,3 +162,10 @@ class PreparedSprings:
             shares = map(layout.accumulate, zip(*forces, strict=True))
             total = [a + b for a, b in zip(total, shares, strict=True)]
         return stack(total)
+
+    def among(self, alive: Array) -> PreparedSprings:
+        """Between the living only, as `Springs.among`."""
+        both = jnp.all(alive[self.edges[:]], axis=1)
+        here = [layout.to_slots(both) for layout in self.layouts]
+        ks, kd = (jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, x) for x in (self.ks, self.kd))
+        return _tree.replace(self, ks=ks, kd=kd)

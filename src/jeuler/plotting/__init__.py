@@ -1,8 +1,10 @@
 """Figures and animations; the only room that imports matplotlib."""
 
 from jeuler.plotting.accuracy import plot_work_precision
+from jeuler.plotting.camera import Camera
+from jeuler.plotting.film import animate
 from jeuler.plotting.fit import plot_fit
-from jeuler.plotting.render import Camera, animate, draw
+from jeuler.plotting.render import Look, draw
 from jeuler.plotting.teaching import (
     error_against_dt,
     euler_polygon,
@@ -14,6 +16,7 @@ from jeuler.plotting.teaching import (
 
 __all__ = [
     "Camera",
+    "Look",
     "animate",
     "draw",
     "error_against_dt",

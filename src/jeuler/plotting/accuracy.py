@@ -32,9 +32,7 @@ def plot_work_precision(table: Any, ax: Any = None) -> Any:
         for pair, own_labels, dtype in zip(ax, labels, dtypes, strict=True):
             _finish(pair, own_labels)
             pair[0].set_title(f"{dtype}: rings mark runs that none beats in both time and error", fontsize=9)
-            pair[1].set_title(
-                f"{dtype}: triangles, largest stable dt; dotted level, roundoff floor", fontsize=9
-            )
+            pair[1].set_title(f"{dtype}: triangles, largest stable dt; dotted level, roundoff floor", fontsize=9)
     else:
         axes = ax if isinstance(ax, (tuple, list, np.ndarray)) else (ax,)
         _finish(axes, _draw(axes, table, dtypes))
@@ -54,9 +52,7 @@ def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list]:
                 _limits(axes[1], table, method, dtype, colours(index))
     front = [r for r in table.rows if r["pareto"] and r["dtype"] in dtypes and _drawable(r)]
     x, y = ([r[column] for r in front] for column in ("run_seconds_min", "error_final_relative"))
-    axes[0].loglog(
-        x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8
-    )
+    axes[0].loglog(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8)
     axes[0].set(xlabel="seconds for one run", ylabel="relative error at the end")
     if len(axes) == 2:
         axes[1].set(xlabel="dt, s")
@@ -124,9 +120,7 @@ def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
     axes.figure.draw_without_rendering()
     low, high = axes.get_window_extent().y0, axes.get_window_extent().y1
     line = min(13 * axes.figure.dpi / 72, (high - low) / max(1, len(labels)))
-    ends = sorted(
-        ((axes.transData.transform((x, y))[1], x, y, text, colour) for x, y, text, colour in labels)
-    )
+    ends = sorted(((axes.transData.transform((x, y))[1], x, y, text, colour) for x, y, text, colour in labels))
     heights = [max(end[0], low + line * i) for i, end in enumerate(ends)]
     for i in range(1, len(heights)):
         heights[i] = max(heights[i], heights[i - 1] + line)

@@ -7,15 +7,56 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib import colors
 
 from jeuler import _tree
+from jeuler.colliders import Box, Plane, Sphere
 
 FILL, EDGE = "#d9d4c7", "#8a8578"
 
 
-def draw_collider(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
-    """Draw a signed distance ``collider(t, point) -> ()`` within center +- half; returns the artists."""
-    return _in_plane(ax, collider, t, center, half) if len(center) == 2 else _in_space(ax, collider, t, center, half)
+def draw_colliders(ax: Any, colliders: list, t: float, view: Any) -> list[Any]:
+    """Draw signed distances ``collider(t, point) -> ()`` within the view; returns the artists.
+
+    In space the ground comes first, then balls and boxes from the far ones to the near ones.
+    """
+    if len(view.center) == 2:
+        return [artist for c in colliders for artist in _in_plane(ax, c, t, view.center, view.half)]
+    toward = view.toward_viewer(t)
+    ground = [c for c in colliders if not _middle(c, t).size]
+    solids = [c for c in colliders if _middle(c, t).size]
+    solids.sort(key=lambda c: -np.inf if _is_shell(c) else float(_middle(c, t) @ toward))
+    artists = [artist for c in ground for artist in _height(ax, c, t, view.center, view.half)]
+    for depth, solid in enumerate(solids):
+        draw = _ball if isinstance(solid, Sphere) else _box
+        artists.append(draw(ax, solid, _middle(solid, t), toward, 0.1 + depth / (1 + len(solids))))
+    return artists
+
+
+def _middle(collider: Any, t: float) -> np.ndarray:
+    """Where a ball or a box is; empty for all others."""
+    if not isinstance(collider, (Sphere, Box)):
+        return np.zeros(0)
+    return np.asarray(collider.center(t) if callable(collider.center) else collider.center)
+
+
+def _is_shell(collider: Any) -> bool:
+    """Whether it is a wall around the particles, of which one sees the far half."""
+    return isinstance(collider, Sphere) and collider.inside
+
+
+def shaded(rgba: np.ndarray, corners: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """Colours (face, 4) in a light that comes from above, on the viewer's left; corners (face, corner, 3).
+
+    A thin surface is lit alike on both its sides.
+    """
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    normal = normal * np.where(normal @ toward < 0, -1.0, 1.0)[:, None]
+    left = np.array([toward[1], -toward[0], 0.0])
+    light = 0.8 * np.array([0.0, 0.0, 1.0]) + 0.5 * left + 0.4 * toward
+    strength = 0.45 + 0.6 * np.clip(normal @ (light / np.linalg.norm(light)), 0, 1)
+    return np.concatenate([np.clip(rgba[:, :3] * strength[:, None], 0, 1), rgba[:, 3:]], axis=1)
 
 
 def distances(collider: Any, t: float, points: np.ndarray) -> np.ndarray:
@@ -55,42 +96,39 @@ def _in_plane(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.nda
     return artists
 
 
-def _in_space(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
-    kind = type(collider).__name__
-    if kind == "Sphere":
-        middle = np.asarray(collider.center(t) if callable(collider.center) else collider.center)
-        a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 40), np.linspace(0, np.pi, 20))
-        ball = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)]) * float(collider.radius)
-        return [_surface(ax, *(ball + middle[:, None, None]))]
-    if kind == "Box":
-        middle = np.asarray(collider.center(t) if callable(collider.center) else collider.center)
-        return _box(ax, middle, np.broadcast_to(np.asarray(collider.half_size), 3))
-    return _height(ax, collider, t, center, half)
+def _ball(ax: Any, ball: Any, middle: np.ndarray, toward: np.ndarray, zorder: float) -> Any:
+    a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 61), np.linspace(0, np.pi, 31))
+    grid = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1) * float(ball.radius) + middle
+    faces = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
+    near = (faces.mean(axis=1) - middle) @ toward > 0
+    return _polygons(ax, faces[~near if _is_shell(ball) else near], toward, zorder)
 
 
-def _surface(ax: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Any:
-    return ax.plot_surface(x, y, z, color=FILL, alpha=0.85, linewidth=0, antialiased=True, zorder=0)
-
-
-def _box(ax: Any, middle: np.ndarray, half: np.ndarray) -> list[Any]:
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-
-    faces = []
+def _box(ax: Any, box: Any, middle: np.ndarray, toward: np.ndarray, zorder: float) -> Any:
+    half, faces = np.broadcast_to(np.asarray(box.half_size), 3), []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        for side in (-1, 1):
-            corners = np.tile(middle, (4, 1)).astype(float)
-            corners[:, axis] += side * half[axis]
-            corners[:, u] += half[u] * np.array([-1, 1, 1, -1])
-            corners[:, v] += half[v] * np.array([-1, -1, 1, 1])
-            faces.append(corners)
-    solid = Poly3DCollection(faces, facecolors=FILL, edgecolors=EDGE, linewidths=0.4, alpha=0.85, zorder=0)
-    return [ax.add_collection3d(solid)]
+        corners = np.tile(middle, (4, 1)).astype(float)
+        corners[:, axis] += half[axis] * (1 if toward[axis] > 0 else -1)  # of two sides one is seen
+        corners[:, u] += half[u] * np.array([-1, 1, 1, -1])
+        corners[:, v] += half[v] * np.array([-1, -1, 1, 1])
+        faces.append(corners)
+    return _polygons(ax, np.array(faces), toward, zorder, edge=EDGE)
+
+
+def _polygons(ax: Any, faces: np.ndarray, toward: np.ndarray, zorder: float, edge: Any = None) -> Any:
+    """Faces (face, corner, 3), lit; without an edge they have that of their own colour, which closes the seams."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    color = shaded(np.tile(colors.to_rgba(FILL), (len(faces), 1)), faces, toward)
+    solid = Poly3DCollection(faces, facecolors=color, edgecolors=edge or color, linewidths=0.4, zorder=zorder)
+    return ax.add_collection3d(solid)
 
 
 def _height(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
     """The upper side of any other solid: for each place (x, y), the highest z at which the distance is 0."""
-    x, y = (np.linspace(center[k] - 1.5 * half[k], center[k] + 1.5 * half[k], 60) for k in range(2))
+    reach = (5.0 if isinstance(collider, Plane) else 2.0) * half
+    x, y = (np.linspace(center[k] - reach[k], center[k] + reach[k], 61) for k in range(2))
     z = np.linspace(center[2] - 1.3 * half[2], center[2] + 1.3 * half[2], 96)
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
     d = distances(collider, t, points)
@@ -104,4 +142,5 @@ def _height(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarr
     below, above = d[i, j, low], d[i, j, low + 1]
     share = np.where(there, below / np.where(below == above, 1, below - above), 0)
     height = np.where(there, z[low] + share * (z[1] - z[0]), np.nan)
-    return [_surface(ax, *np.meshgrid(x, y, indexing="ij"), height)]
+    x, y = np.meshgrid(x, y, indexing="ij")
+    return [ax.plot_surface(x, y, height, color=FILL, alpha=0.85, linewidth=0, antialiased=True, zorder=0)]

@@ -49,9 +49,7 @@ def slope_field(
 
     ax = _axes(ax)
     times, states = np.meshgrid(np.linspace(*t, num), np.linspace(*y, num), indexing="ij")
-    slopes = np.asarray(
-        jax.vmap(lambda t, y: f(t, y, args))(jnp.asarray(times.ravel()), jnp.asarray(states.ravel()))
-    )
+    slopes = np.asarray(jax.vmap(lambda t, y: f(t, y, args))(jnp.asarray(times.ravel()), jnp.asarray(states.ravel())))
     aspect = (t[1] - t[0]) / (y[1] - y[0])  # lines of equal length on the page
     across = 1 / np.hypot(1, slopes.reshape(times.shape) * aspect)
     ax.quiver(

@@ -18,6 +18,7 @@ from jeuler.scenes.setup import Setup
 from jeuler.state import ParticleState
 
 GOAL = np.array([60.0, 0.0])
+SLOW, FAST = np.array([0.1, 0.2, 0.55]), np.array([0.9, 0.3, 0.1])  # colours
 ROCKS = ((5.0, 6.0), (14.0, -9.0), (26.0, 2.0))
 
 
@@ -48,18 +49,19 @@ def keep_apart(t, position, velocity, mass):
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # each agent counts at the four corners of its cell
         share = jnp.abs(1 - i - part[0]) * jnp.abs(1 - j - part[1])
         crowd = crowd.at[corner[0] + i, corner[1] + j].add(share)
+    for axis in (0, 1, 0, 1):  # smoothed, or agents would line up with the cells
+        crowd = (jnp.roll(crowd, 1, axis) + 2 * crowd + jnp.roll(crowd, -1, axis)) / 4
     slope = [jax.scipy.ndimage.map_coordinates(x, list(place), order=1) for x in jnp.gradient(crowd)]
-    return jnp.stack([-2.5 * slope[0], -2.5 * slope[1], jnp.zeros(len(position), position.dtype)], axis=1)
+    return jnp.stack([-5.0 * slope[0], -5.0 * slope[1], jnp.zeros(len(position), position.dtype)], axis=1)
 
 
 @uses(sets=("color",))
 def on_the_ground(t, dt, state, key):
     """Feet on the land; an agent is the redder the faster it runs."""
     p, v = state.position, state.velocity
-    speed = jnp.clip(jnp.linalg.norm(v[:, :2], axis=1, keepdims=True) / 8, 0, 1)
-    slow, fast = jnp.array([0.15, 0.25, 0.5], p.dtype), jnp.array([0.85, 0.25, 0.1], p.dtype)
+    speed = jnp.clip(jnp.linalg.norm(v[:, :2], axis=1, keepdims=True) / 8 * 2 - 1, 0, 1)
     position = p.at[:, 2].set(height(p[:, 0], p[:, 1]) + 0.3)
-    return state.replace(position=position, velocity=v.at[:, 2].set(0.0), color=slow + speed * (fast - slow))
+    return state.replace(position=position, velocity=v.at[:, 2].set(0.0), color=SLOW + speed * (FAST - SLOW))
 
 
 ROCK_SOLIDS = tuple(Sphere([x, y, float(height(x, y))], 2.0) for x, y in ROCKS)
@@ -77,6 +79,6 @@ def charge(agents: int = 5000) -> Setup:
     )
     limit = random.normal(7.0, 0.8, agents).clip(4.0, 9.0)
     scene = Scene((run_to_goal, keep_apart, *rocks), (SpeedLimit(limit), on_the_ground))
-    state = ParticleState(position, 0 * position, size=np.full(agents, 0.55))
-    camera = {"center": [0.0, 0.0, 0.0], "width": 90.0, "elevation": 32.0, "azimuth": -62.0}
+    state = ParticleState(position, 0 * position, color=np.tile(SLOW, (agents, 1)), size=np.full(agents, 0.6))
+    camera = {"center": [4.0, 0.0, 0.0], "width": 112.0, "elevation": 32.0, "azimuth": -62.0}
     return Setup(scene, state, 0.05, 240, 4, camera, frame=32)

@@ -32,8 +32,8 @@ def fountain() -> Setup:
     fade = OverLife("opacity", [0.95, 0.7, 0.0], times=[0.0, 0.8, 1.0])
     grow = OverLife("size", [0.035, 0.06])
     scene = Scene((Gravity([0.0, 0.0, -9.81]), LinearDrag(0.15, air=air)), (jet, Lifetime(), ground, blue, fade, grow))
-    camera = {"center": [0.5, 0.0, 1.2], "width": 5.0, "azimuth": -80.0, "elevation": 10.0}
-    return Setup(scene, empty_pool(4000, dim=3), 0.02, 200, 2, camera, background="#10151f")
+    camera = {"center": [0.45, 0.0, 1.25], "width": 4.4, "azimuth": -90.0, "elevation": 10.0}
+    return Setup(scene, empty_pool(4000, dim=3), 0.02, 200, 2, camera, {"background": "#10151f"})
 
 
 def smoke_column() -> Setup:
@@ -57,8 +57,8 @@ def smoke_column() -> Setup:
     fade = OverLife("opacity", [0.5, 0.3, 0.0], times=[0.0, 0.3, 1.0])
     spread = OverLife("size", [0.06, 0.16, 0.5], times=[0.0, 0.3, 1.0])
     scene = Scene((buoyancy, LinearDrag(2.0, air=air)), (fire, Lifetime(), glow, fade, spread))
-    camera = {"center": [0.0, 0.0, 2.6], "width": 6.6, "elevation": 8.0}
-    return Setup(scene, empty_pool(4000, dim=3), 0.02, 250, 2, camera, background="#15171c")
+    camera = {"center": [0.0, 0.0, 2.3], "width": 6.8, "elevation": 8.0}
+    return Setup(scene, empty_pool(4000, dim=3), 0.02, 250, 2, camera, {"background": "#15171c"})
 
 
 def rain_on_pegs(rows: int = 9, spacing: float = 0.2) -> Setup:
@@ -85,5 +85,5 @@ def rain_on_pegs(rows: int = 9, spacing: float = 0.2) -> Setup:
     )
     contact = Collisions((pegs,), radius=0.012, restitution=0.35, friction=0.05)
     scene = Scene((Gravity([0.0, -9.81]), LinearDrag(1.5)), (cloud, DeathOutside([-2.0, -0.5], [2.0, 4.0]), contact))
-    camera = {"center": [0.0, 0.9], "width": 2.8}
+    camera = {"center": [0.0, 1.1], "width": 3.2}
     return Setup(scene, empty_pool(1200, dim=2), 0.005, 1000, 8, camera)

@@ -20,8 +20,7 @@ class Setup:
     Args:
       scene, state: what `simulate` takes.
       dt, num_steps, save_every: how it takes them, dt in s.
-      camera: named arguments of a ``plotting.render.Camera``.
-      background: colour of the picture.
+      camera, look: named arguments of a ``plotting.Camera`` and a ``plotting.Look``.
       frame: the saved state that makes the best picture.
       step: the method.
     """
@@ -32,7 +31,7 @@ class Setup:
     num_steps: int
     save_every: int
     camera: dict[str, Any] = dataclasses.field(default_factory=dict)
-    background: str = "white"
+    look: dict[str, Any] = dataclasses.field(default_factory=dict)
     frame: int = -1
     step: Any = symplectic_euler_step
 
@@ -51,21 +50,21 @@ class Setup:
 
     def film(self, path: Any = None, **options: Any) -> Any:
         """The film of the run, written to the path (.gif, .mp4, .html) if there is one."""
-        from jeuler.plotting.render import Camera, animate
+        from jeuler.plotting.film import animate
 
-        look: dict[str, Any] = {"camera": Camera(**self.camera), "background": self.background}
-        return animate(self.run(), self.scene, path, **(look | options))
+        return animate(self.run(), self.scene, path, **(self._shown() | options))
 
     def picture(self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any) -> None:
         """A picture of one saved state of the run, written to the path."""
-        from jeuler.plotting.render import Camera, save_picture
+        from jeuler.plotting.render import save_picture
 
         solution = self.run() if solution is None else solution
         frame = self.frame if frame is None else frame
         state = jax.tree.map(lambda x: x[frame], solution.y)
-        look: dict[str, Any] = {
-            "camera": Camera(**self.camera),
-            "background": self.background,
-            "t": float(solution.t[frame]),
-        }
-        save_picture(path, state, self.scene, **(look | options))
+        save_picture(path, state, self.scene, t=float(solution.t[frame]), **(self._shown() | options))
+
+    def _shown(self) -> dict[str, Any]:
+        from jeuler.plotting.camera import Camera
+        from jeuler.plotting.render import Look
+
+        return {"camera": Camera(**self.camera), "look": Look(**self.look)}
