@@ -173,6 +173,11 @@ class AdaptiveSolution:
       error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of
         its own error, before the equation damps or amplifies it.
       finished: whether the last time was reached within max_steps; if not, the states from there on are NaN.
+    Example:
+      >>> import jeuler
+      >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=1.0, max_steps=2, dt0=0.1)
+      >>> run.t.tolist(), run.y.tolist(), int(run.num_steps), bool(run.finished)
+      ([0.0, 1.0], [1.0, nan], 2, False)
     """
 
     t: Array

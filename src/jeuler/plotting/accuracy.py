@@ -22,6 +22,17 @@ def plot_work_precision(table: Any, ax: Any = None) -> Any:
       table: what `work_precision` returned.
       ax: None makes a figure; one axes takes error against seconds, a pair takes both, of all precisions.
     Returns: the axes drawn on: (precision, 2), or as given.
+    Raises: nothing.
+    Example:
+      >>> import jeuler
+      >>> from jeuler.plotting import plot_work_precision
+      >>> table = jeuler.work_precision(lambda t, y, args: -y, 1.0, t1=1.0, dts=[0.1, 0.01],
+      ...     steps={"Euler": jeuler.euler_step}, reference=lambda t: 2.718281828459045**-t, repeats=1)
+      >>> axes = plot_work_precision(table)
+      >>> axes.shape, axes[0, 1].get_xlabel()
+      ((1, 2), 'dt, s')
+
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.10.
     """
     dtypes = list(dict.fromkeys(row["dtype"] for row in table.rows))
     if ax is None:
@@ -113,6 +124,14 @@ def _limits(axes: Any, table: Any, method: str, dtype: str, colour: Any) -> None
                 transform=where,
                 clip_on=False,
             )
+
+
+def axes_or_new(ax: Any, size: tuple[float, float] = (7, 4.2)) -> Any:
+    """The axes given, or those of a new figure."""
+    if ax is None:
+        _, ax = plt.subplots(figsize=size, layout="constrained")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
 
 
 def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
