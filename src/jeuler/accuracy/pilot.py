@@ -97,11 +97,14 @@ class Ladder:
                 self.best, self.doubt = finer[-1], change
             column = finer
 
+    def error_of(self, final: np.ndarray) -> float:
+        """Norm of a final state's difference from the extrapolated one; inf where either is lost."""
+        error = np.inf if self.best is None else distance(final, self.best)
+        return error if np.isfinite(error) else np.inf
+
     def errors(self) -> np.ndarray:
-        """Norm of each final state's difference from the extrapolated one."""
-        if self.best is None:
-            return np.full(len(self.finals), np.inf)
-        return np.array([distance(final, self.best) for final in self.finals])
+        """The error of each run so far."""
+        return np.array([self.error_of(final) for final in self.finals])
 
     def observed_orders(self) -> np.ndarray:
         """log2 of the ratio of the errors of neighbours."""

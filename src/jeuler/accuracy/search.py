@@ -129,8 +129,7 @@ class Search:
         def error_of(num_steps: int) -> float:
             nonlocal spent
             spent += num_steps
-            error = distance(self.pilot(num_steps)[-1], ladder.best)
-            return error if math.isfinite(error) else math.inf
+            return ladder.error_of(self.pilot(num_steps)[-1])
 
         def firm(num_steps: int) -> bool:
             fewer = math.ceil(num_steps * (1 - MARGIN))
@@ -165,7 +164,7 @@ class Search:
         run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.target(ladder)
         num_steps, met = 1, False
         while num_steps < min(fewer_than, self.most // 16):
-            before, met = met, distance(run(num_steps)[-1], ladder.best) <= aim  # NaN is not
+            before, met = met, ladder.error_of(run(num_steps)[-1]) <= aim
             if before and met:  # twice running: no accident
                 return num_steps // 2
             num_steps *= 2

@@ -12,9 +12,9 @@ import numpy as np
 
 from jeuler import _check
 from jeuler._precision import double_precision
+from jeuler.amplification import amplification
 from jeuler.methods import Step
 from jeuler.plotting.accuracy import axes_or_new, label_ends
-from jeuler.stability import amplification
 
 
 def stability_regions(
