@@ -11,6 +11,7 @@ import cases
 import pytest
 
 import jeuler
+import jeuler.plotting
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 
@@ -20,10 +21,20 @@ def test_public_name_has_a_full_docstring(name):
     doc = inspect.getdoc(getattr(jeuler, name))
     assert doc
     assert doc.splitlines()[0].endswith((".", ":"))
-    if "Attributes:" in doc:  # what functions give back
-        return
-    for section in ("Args:", "Raises:", "Example:", ">>>", "Source:"):
+    gives_back = "Attributes:" in doc  # a class of results, which nobody makes
+    for section in ("Example:", ">>>") if gives_back else ("Args:", "Raises:", "Example:", ">>>", "Source:"):
         assert section in doc, section
+
+
+@pytest.mark.parametrize("name", jeuler.plotting.__all__)
+def test_figure_has_a_docstring_with_an_example(name):
+    doc = inspect.getdoc(getattr(jeuler.plotting, name))
+    for section in ("Args:", "Example:", ">>>"):
+        assert section in doc, section
+    if name in jeuler.plotting.teaching.__all__:  # they explain a formula
+        assert re.search(r"\n\n {4}.*[=:].*\n", doc)
+        assert "Raises:" in doc
+        assert "Source:" in doc
 
 
 @pytest.mark.parametrize("name", jeuler.__all__)

@@ -8,7 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jeuler
-from jeuler.extrapolation import Lanes, extrapolated_euler, solve_adaptive
+from jeuler.adaptive import solve_adaptive
+from jeuler.extrapolation import Lanes, extrapolated_euler
 from jeuler.implicit import linearly_implicit_euler_step
 
 

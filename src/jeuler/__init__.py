@@ -1,6 +1,7 @@
 """jeuler: differentiable Euler integration of springs, particles and ODEs in JAX."""
 
 from jeuler.accuracy import Compensated, StepAdvice, WorkPrecision, advise_step, work_precision
+from jeuler.adaptive import AdaptiveSolution, solve_adaptive
 from jeuler.colliders import Box, Plane, Sphere
 from jeuler.declare import uses
 from jeuler.diagnose import Diagnosis, diagnose
@@ -24,7 +25,7 @@ from jeuler.effects import (
     SpeedLimit,
     Uniform,
 )
-from jeuler.extrapolation import AdaptiveSolution, extrapolated_euler, solve_adaptive
+from jeuler.extrapolation import extrapolated_euler
 from jeuler.fitting import Fit, SpringFit, fit, fit_springs
 from jeuler.forces import (
     Bending,

@@ -30,6 +30,13 @@ class Diagnosis:
       springs: indices of the springs concerned, where the part is a force of springs.
       cause: the likely cause, in words.
       remedy: what to do.
+    Example:
+      >>> import jeuler
+      >>> found = jeuler.Diagnosis(False, step=3, part="forces[0] Springs", springs=(4,), cause="it blew up",
+      ...     remedy="take a smaller dt")
+      >>> found.finite, found.springs, print(jeuler.Diagnosis(finite=True))
+      every value and gradient that was looked at is finite
+      (False, (4,), None)
     """
 
     finite: bool

@@ -30,6 +30,11 @@ class Solution:
       y: the saved states, or what ``save`` made of them: a pytree with leading axis saved, the initial value first.
       first_nonfinite: int32 scalar: -1, or the 1-based number of the first step whose result is not finite.
         Under ``vmap`` one number a batch member.
+    Example:
+      >>> import jeuler
+      >>> run = jeuler.solve(lambda t, y, args: y * y, 1.0, dt=0.5, num_steps=20, save_every=10)
+      >>> run.t.tolist(), run.y.tolist(), int(run.first_nonfinite)
+      ([0.0, 5.0, 10.0], [1.0, inf, inf], 10)
     """
 
     t: Array

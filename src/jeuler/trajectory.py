@@ -18,6 +18,12 @@ class Trajectory(NamedTuple):
     Attributes:
       times: the time column, (row,), as the file has it.
       columns: every other column by name, in the file's order, (row,) each; NaN = missing cell.
+    Example:
+      >>> import numpy as np, jeuler
+      >>> swing = jeuler.Trajectory(np.array([0.0, 0.1]), {"x": np.array([1.0, 0.9])})
+      >>> times, columns = swing
+      >>> columns["x"].tolist()
+      [1.0, 0.9]
     """
 
     times: np.ndarray

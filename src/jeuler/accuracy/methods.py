@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler.accuracy.timing import counting
-from jeuler.extrapolation import ExtrapolatedStep, solve_adaptive
+from jeuler.adaptive import solve_adaptive
+from jeuler.extrapolation import ExtrapolatedStep
 from jeuler.methods import Step, VectorField
 from jeuler.solve import solve
 

@@ -89,20 +89,30 @@ class Ladder:
         column = self.finals[-6:]
         for m in range(min(5, len(column) - 1)):
             factor = 2.0 ** (self.order + m) - 1
-            finer = [b + (b - a) / factor for a, b in itertools.pairwise(column)]
+            with np.errstate(over="ignore", invalid="ignore"):  # the runs before may have grown beyond all bounds
+                finer = [b + (b - a) / factor for a, b in itertools.pairwise(column)]
             # two entries of the new column must agree, or one new entry be near the column before
-            change = np.linalg.norm(finer[-1] - (finer[-2] if len(finer) > 1 else column[-1]))
+            change = distance(finer[-1], finer[-2] if len(finer) > 1 else column[-1])
             if change < self.doubt:
-                self.best, self.doubt = finer[-1], float(change)
+                self.best, self.doubt = finer[-1], change
             column = finer
 
+    def error_of(self, final: np.ndarray) -> float:
+        """Norm of a final state's difference from the extrapolated one; inf where either is lost."""
+        error = np.inf if self.best is None else distance(final, self.best)
+        return error if np.isfinite(error) else np.inf
+
     def errors(self) -> np.ndarray:
-        """Norm of each final state's difference from the extrapolated one."""
-        if self.best is None:
-            return np.full(len(self.finals), np.inf)
-        return np.array([np.linalg.norm(final - self.best) for final in self.finals])
+        """The error of each run so far."""
+        return np.array([self.error_of(final) for final in self.finals])
 
     def observed_orders(self) -> np.ndarray:
         """log2 of the ratio of the errors of neighbours."""
         errors = np.maximum(self.errors(), 1e-300)
         return np.log2(errors[:-1] / errors[1:])
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    """Euclidean norm of the difference of two states; inf or NaN, without a warning, where one is lost."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.linalg.norm(a - b))

@@ -77,6 +77,15 @@ class WorkPrecision:
       stability_limits: largest stable dt of each method at the initial state, s.
       reference_error: how far the reference itself may be trusted at t1; errors below say nothing.
       interval: (t0, t1), s.
+    Example:
+      >>> import jeuler
+      >>> table = jeuler.work_precision(lambda t, y, args: -y, 1.0, t1=1.0, dts=[0.1, 0.01, 0.001],
+      ...     steps={"Euler": jeuler.euler_step}, reference=lambda t: 2.718281828459045**-t, repeats=1)
+      >>> [(row["num_steps"], round(row["error_final_relative"], 4)) for row in table.rows]
+      [(10, 0.0522), (100, 0.005), (1000, 0.0005)]
+      >>> round(table.summary[0].order, 1), round(table.stability_limits["Euler"], 6)
+      (1.0, 2.0)
+
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.10.
     """
 

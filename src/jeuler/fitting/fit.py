@@ -37,6 +37,14 @@ class Fit:
       message: what happened, in one sentence.
       undetermined: names of the parameters that the data say nothing about; they stayed at their start.
       nonfinite: how many trial points gave a value or gradient that was not finite and were stepped back from.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> x = jnp.linspace(0.0, 1.0, 11)
+      >>> found = jeuler.fit(lambda p: p["slope"] * x - 3 * x, {"slope": 1.0, "unused": 5.0})
+      >>> {name: round(float(value), 3) for name, value in found.params.items()}
+      {'slope': 3.0, 'unused': 5.0}
+      >>> found.converged, found.undetermined, float(found.stderr["unused"])
+      (True, ("['unused']",), inf)
     """
 
     params: PyTree

@@ -36,6 +36,16 @@ class SpringFit:
       covariance: of the parameters in the order of ``jax.flatten_util.ravel_pytree(params)``.
       predicted: positions at the given times, (time, particle, dim), m.
       converged, message, undetermined, nonfinite: as in `Fit`.
+    Example:
+      >>> import jax.numpy as jnp, numpy as np, jeuler
+      >>> weight = jeuler.ParticleState([[0.0], [1.2]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
+      >>> scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks=25.0, kd=0.0, rest_length=1.0),))
+      >>> times = np.linspace(0.0, 2.0, 41)
+      >>> swinging = 1 + 0.2 * np.cos(np.sqrt(30.0) * times)  # of ks = 30 N/m
+      >>> positions = np.stack([0 * times, swinging], 1)[..., None]
+      >>> found = jeuler.fit_springs(scene, weight, times, positions, dt=0.01, parameters=("ks",))
+      >>> round(float(found.ks), 1), found.converged, found.predicted.shape
+      (30.0, True, (41, 2, 1))
     """
 
     ks: Any

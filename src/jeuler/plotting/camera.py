@@ -19,6 +19,10 @@ class Camera:
       width: m, the width of the view; None fits the particles.
       follow: a particle's index or "mean": the view moves along with it.
       elevation, azimuth: in space, the direction from which one looks, degrees; azimuth may be a function of time.
+    Example:
+      >>> from jeuler.plotting import Camera
+      >>> Camera(width=3.0, azimuth=lambda t: 10 * t).azimuth(2.0)  # turns by 10 degrees a second
+      20.0
     """
 
     center: Any = None

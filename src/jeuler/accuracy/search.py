@@ -1,0 +1,193 @@
+"""The search behind advise_step: pilot runs of one problem, and the fewest steps that meet a target error."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from jeuler import _tree
+from jeuler._precision import double_precision, flat
+from jeuler.accuracy.pilot import Ladder, Pilot, distance
+from jeuler.accuracy.roundoff import Rounding
+from jeuler.implicit import linearly_implicit_euler_step
+from jeuler.methods import Step, VectorField
+from jeuler.stability import Linearisation
+
+PyTree = Any
+
+AIM = 0.8  # of the target: an answer errs on the side of accuracy
+NEAR = 0.75  # of the aim: an error between this and the aim ends the search
+FACTOR = 3.0  # an error within this factor of the target is near it
+MARGIN = 0.01  # by which dt may be larger with the error still near the target
+FINENESS = 1e-3  # part of the number of steps below which the search makes no difference
+TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
+ROUGH = 2**18  # steps of the longest run in float32
+REGULAR = 0.25  # and the observed order be this close to the step's own, to predict beyond the pilots
+
+
+class Search:
+    """Pilot runs of one step on one problem, looking for the fewest steps whose error meets the target."""
+
+    def __init__(
+        self,
+        f: VectorField,
+        y0: PyTree,
+        t0: float,
+        t1: float,
+        args: PyTree,
+        step: Step,
+        error: float,
+        *,
+        relative: bool,
+        compensated: bool,
+        most: int,
+    ) -> None:
+        self.f, self.start, self.t0, self.t1, self.args, self.step = f, y0, t0, t1, args, step
+        self.error, self.relative, self.compensated, self.most = error, relative, compensated, most
+        self.interval = t1 - t0
+        self.order = int(getattr(step, "order", 1))
+        self.dtype = np.dtype(_tree.time_dtype(y0))
+        with double_precision():
+            self.linear = Linearisation(f, y0, args)
+        self.pilot = self.runs(step, np.float64, compensated)
+        self.stability = math.inf  # largest stable dt
+        self.bound = math.inf  # largest dt whose instability, if any, stays small until t1
+        self.look_at_stability(flat(y0)[None], np.array([t0]))
+
+    def runs(self, step: Step, dtype: Any, compensated: bool) -> Pilot:
+        return Pilot(self.f, self.start, self.t0, self.t1, self.args, step, dtype, compensated)
+
+    def scale(self, final: Any) -> float:
+        """The unit of the target, in the units of the state."""
+        return float(np.linalg.norm(final)) if self.relative else 1.0
+
+    def target(self, ladder: Ladder) -> float:
+        """The target in the units of the state."""
+        return self.error * self.scale(ladder.best)
+
+    def look_at_stability(self, states: np.ndarray, times: np.ndarray) -> None:
+        """Narrow the limits by the spectra at these states."""
+        with double_precision():
+            for state, t in zip(states, times, strict=True):
+                try:
+                    limit, bound = self.linear.limits(t, state, self.step, interval=self.interval)
+                except (ValueError, TypeError, np.linalg.LinAlgError):
+                    continue  # a Jacobian that is not finite; the pilots will show what happens there
+                self.stability, self.bound = min(self.stability, limit), min(self.bound, bound)
+
+    def climb(self, num_steps: int) -> Ladder | None:
+        """Double the steps until the error of the finest run is known and either meets the target or follows
+        the order."""
+        ladder, looked = Ladder(self.order), False
+        while num_steps <= self.most:
+            states = self.pilot(num_steps)
+            ladder.add(num_steps, states[-1])
+            if len(ladder.finals) >= 4 and self._trusted(ladder):
+                if not looked:
+                    looked = True
+                    times = self.t0 + self.interval * np.arange(1, len(states) + 1) / len(states)
+                    self.look_at_stability(states[::2], times[::2])
+                if ladder.errors()[-1] <= self.target(ladder) or self._regular(ladder):
+                    return ladder
+            num_steps *= 2
+        return None
+
+    def _trusted(self, ladder: Ladder) -> bool:
+        """Whether the extrapolated state is known well enough, now and one run before, to judge the
+        target."""
+        if ladder.best is None or not np.all(np.isfinite(ladder.best)):
+            return False
+        target, error = self.target(ladder), ladder.errors()[-1]
+        converged = error < 1e-13 * np.linalg.norm(ladder.best)
+        falling = np.all(ladder.observed_orders()[-2:] > 0.5 * self.order) or converged
+        return target > 0 and falling and ladder.doubt <= TRUST * max(target, error)
+
+    def _regular(self, ladder: Ladder) -> bool:
+        """Whether the last errors fall as the order says, so that finer ones may be predicted."""
+        orders = ladder.observed_orders()[-3:]
+        return bool(np.all(np.abs(orders - self.order) < REGULAR)) and ladder.doubt <= TRUST * ladder.errors()[-1]
+
+    def predicted(self, ladder: Ladder) -> tuple[int, float]:
+        """Steps beyond the pilots that the order of the step and the stability at the sampled states ask for,
+        and the error to expect of them."""
+        error = float(ladder.errors()[-1])
+        more = (error / (AIM * self.target(ladder))) ** (1 / self.order)
+        num_steps = max(math.ceil(ladder.num_steps[-1] * more), math.ceil(self.interval / self.bound))
+        return num_steps, error * (ladder.num_steps[-1] / num_steps) ** self.order
+
+    def fewest(self, ladder: Ladder) -> tuple[int, float]:
+        """The fewest steps that meet the aim and stand on firm ground, by bisection on runs; and their error.
+
+        Between the coarsest rung from which on all meet the aim, and the rung before. Firm ground: with dt 1 %
+        larger the error is still within a factor 3 of the target, so no run balances on the edge of instability.
+        """
+        aim, near = AIM * self.target(ladder), FACTOR * self.target(ladder)
+        spent = 0
+
+        def error_of(num_steps: int) -> float:
+            nonlocal spent
+            spent += num_steps
+            return ladder.error_of(self.pilot(num_steps)[-1])
+
+        def firm(num_steps: int) -> bool:
+            fewer = math.ceil(num_steps * (1 - MARGIN))
+            return (low <= fewer and error_low <= near) or error_of(fewer) <= near
+
+        errors = ladder.errors()
+        rung = len(errors) - 1
+        while rung > 0 and errors[rung - 1] <= aim:
+            rung -= 1
+        high, error_high = ladder.num_steps[rung], float(errors[rung])
+        low, error_low = (ladder.num_steps[rung - 1], float(errors[rung - 1])) if rung else (high // 2, math.inf)
+        if not firm(high):
+            low, error_low = high, math.inf
+            high *= 2
+            error_high = error_of(high)
+        while error_high < NEAR * aim and high - low > max(1, FINENESS * high) and spent < 8 * self.most:
+            part = 0.5
+            if math.isfinite(error_low):  # log-log interpolation, kept off the ends
+                part = math.log(error_low / (0.93 * aim)) / math.log(error_low / error_high)
+                part = min(max(part, 0.02), 0.98)
+            middle = min(max(round(low * (high / low) ** part), low + 1), high - 1)
+            error = error_of(middle)
+            if error <= aim and firm(middle):
+                high, error_high = middle, error
+            else:
+                low, error_low = middle, error if error > aim else math.inf
+        return high, error_high
+
+    def implicit_steps(self, ladder: Ladder, fewer_than: int) -> int | None:
+        """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that
+        few."""
+        run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.target(ladder)
+        num_steps, met = 1, False
+        while num_steps < min(fewer_than, self.most // 16):
+            before, met = met, ladder.error_of(run(num_steps)[-1]) <= aim
+            if before and met:  # twice running: no accident
+                return num_steps // 2
+            num_steps *= 2
+        return None
+
+    def rounding(self, ladder: Ladder) -> Rounding:
+        """Roundoff against steps, in the terms of the target and the precision of y0.
+
+        Measured as the difference between runs in float32 and in float64; for a y0 in float32 at the steps where
+        its error is least, for one in float64 (out of reach) carried over by the ratio of the two eps.
+        """
+        rough, scale = self.runs(self.step, np.float32, self.compensated), self.scale(ladder.best)
+        carried = float(np.finfo(self.dtype).eps / np.finfo(np.float32).eps) / scale
+        known = dict(zip(ladder.num_steps, ladder.finals, strict=True))
+
+        def fitted(counts: list[int]) -> Rounding:
+            pairs = ((rough(n)[-1], known[n] if n in known else self.pilot(n)[-1]) for n in counts)
+            return Rounding.fitted(counts, [carried * distance(*pair) for pair in pairs], self.compensated)
+
+        counts = [n for n in ladder.num_steps if n <= ROUGH][-4:] or [ROUGH]
+        law = fitted(counts)
+        truncation = ladder.errors()[-1] / scale * ladder.num_steps[-1] ** self.order
+        turn = min(law.floor(truncation, self.order)[1], ROUGH)
+        if self.dtype == np.float32 and turn > counts[-1]:
+            law = fitted([int(n) for n in np.geomspace(turn / 8, turn, 6)])
+        return law
