@@ -222,10 +222,10 @@ class _Step:
             s = search(gap, start)
             roundoff = self.roundoff(path.x)
             distance, rate = slope(start)
-            touching = (distance <= roundoff) & (rate < 0)
+            touching = (distance <= roundoff) & (rate < -roundoff)  # a slower approach is rounding, not an impact
             inside = distance < -roundoff  # overlap from the start: no root to follow
             distance, rate = slope(s)
-            meeting = (s <= 1) & (rate < 0) & (jnp.abs(distance) <= roundoff + 1e-6 * length(way))
+            meeting = (s <= 1) & (rate < -roundoff) & (jnp.abs(distance) <= roundoff + 1e-6 * length(way))
             return s, (touching, inside, meeting)
 
         def tangent_solve(matvec, b):
@@ -249,8 +249,9 @@ class _Step:
         apart, way = at_start(self.i) - at_start(self.j), way[self.i] - way[self.j]
         a, b = jnp.sum(way * way, axis=-1), jnp.sum(apart * way, axis=-1)
         c = jnp.sum(apart * apart, axis=-1) - (self.radius[self.i] + self.radius[self.j]) ** 2
-        roundoff = 64 * jnp.finfo(c.dtype).eps * (jnp.max(jnp.abs(path.x)) + jnp.max(self.radius)) ** 2
-        touching, crossing = (c <= roundoff) & (b < 0), (b < 0) & (b * b > a * c)
+        size, eps = jnp.max(jnp.abs(path.x)) + jnp.max(self.radius), jnp.finfo(c.dtype).eps
+        touching = (c <= 64 * eps * size**2) & (b < -16 * eps * size * length(apart))
+        crossing = (b < 0) & (b * b > a * c)
         root_of = jnp.sqrt(jnp.where(crossing, b * b - a * c, 1))
         delay = jnp.where(crossing, c / jnp.where(crossing, root_of - b, 1), jnp.inf)
         s = start + jnp.where(touching, 0, delay)

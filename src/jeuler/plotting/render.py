@@ -32,6 +32,11 @@ class Look:
       faces: the particles at the corners of a surface's triangles, integers (face, 3): cloth, the skin of a body,
         shaded in the colour of its particles.
       particles: False draws no particles, only what they hold.
+    Raises: ValueError, if links is none of the three or faces are not (face, 3).
+    Example:
+      >>> from jeuler.plotting import Look
+      >>> Look(background="black", links="color").width  # hair on black
+      0.9
     """
 
     background: Any = "white"
