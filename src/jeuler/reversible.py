@@ -116,7 +116,12 @@ def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyT
 
     run = jax.custom_vjp(forward)
     run.defvjp(kept, backward)
-    largest = lax.stop_gradient(_largest(acceleration, pair(y0)[0], parameters, grid.num_steps))
+
+    def field(n: Array, y: PyTree, parameters: list[Array]) -> PyTree:
+        x, v = y
+        return v, acceleration(n, x, v, parameters)
+
+    largest = _largest(field, *lax.stop_gradient((pair(y0)[0], parameters)), grid.num_steps)
     quanta = jax.tree.map(quantum, largest)
     start = jax.tree.map(_on_grid, pair(y0)[0], quanta)
 
@@ -162,18 +167,16 @@ def _on_grid_jvp(primals, tangents):
     return _on_grid(*primals), tangents[0]
 
 
-def _largest(acceleration: Callable, y: PyTree, parameters: list[Array], num_steps: int) -> PyTree:
-    """The largest magnitude in each array of y over a plain run."""
-    dt = parameters[0]
+def _largest(field: Callable, y: PyTree, parameters: list[Array], num_steps: int) -> PyTree:
+    """The largest magnitude in each array of y over a plain run, whose clock is the number of the step."""
 
     def magnitude(y):
         return jax.tree.map(lambda leaf: jnp.max(jnp.abs(leaf), initial=0), y)
 
     def one_step(carry, n):
-        (x, v), largest = carry
-        v = _tree.add(v, _tree.scale(dt, acceleration(n, x, v, parameters)))
-        x = _tree.add(x, _tree.scale(dt, v))
-        return ((x, v), jax.tree.map(jnp.maximum, largest, magnitude((x, v)))), None
+        y, largest = carry
+        y = symplectic_euler_step(field, n, y, parameters[0], parameters)
+        return (y, jax.tree.map(jnp.maximum, largest, magnitude(y))), None
 
     return lax.scan(one_step, (y, magnitude(y)), jnp.arange(num_steps, dtype=jnp.int32))[0][1]
 
