@@ -82,8 +82,30 @@ def transported_frames(edges: Array) -> Array:
     return jnp.swapaxes(frames, -1, -2)
 
 
+class _OnStrands:
+    """What the forces on strands share: fields as arrays, their checks, and strands that die as a whole."""
+
+    strands: Any
+    rest_position: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "strands", Indices(self.strands))
+        _tree.store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
+        check_strands(type(self).__name__, self.strands, self.rest_position)
+
+    def among(self, alive: Array) -> Any:
+        """Only strands that live as a whole."""
+        here = jnp.all(alive[np.asarray(self.strands)], axis=1)
+        return _tree.replace(self, here=here.astype(self.rest_position.dtype))
+
+    def check(self, particles: int, dim: int) -> None:
+        check_indices(f"{type(self).__name__}.strands", self.strands, particles)
+        if dim != 3:
+            raise ValueError(f"{type(self).__name__} needs particles in space, dim 3, got dim {dim}")
+
+
 @_tree.component(static=("strands",))
-class StrandBending:
+class StrandBending(_OnStrands):
     """Bending springs of curly hair: each edge is pulled to its rest direction in the frame of the smoothed strand.
 
         F on node i = k (e_i - t_i) + c (dv_i - (dv_i . u_i) u_i),   and the opposite on node i + 1
@@ -119,11 +141,6 @@ class StrandBending:
     smoothing: Array
     here: Array | None = None
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "strands", Indices(self.strands))
-        _tree.store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
-        check_strands("StrandBending", self.strands, self.rest_position)
-
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         nodes = np.asarray(self.strands)
         rest = jnp.diff(self.rest_position, axis=1).astype(position.dtype)
@@ -139,16 +156,9 @@ class StrandBending:
         pull = self.stiffness * (e[:, 1:] - target) + self.damping * across
         return give_to_ends(pull.astype(position.dtype), self.here, nodes[:, 1:], position)
 
-    def among(self, alive: Array) -> StrandBending:
-        """Only strands that live as a whole."""
-        return _tree.replace(self, here=whole(alive, self.strands, self.rest_position.dtype))
-
-    def check(self, particles: int, dim: int) -> None:
-        check_in_scene("StrandBending", self.strands, particles, dim)
-
 
 @_tree.component(static=("strands",))
-class StrandCore:
+class StrandCore(_OnStrands):
     """Core springs of curly hair: they keep the coils from being pulled straight, yet let them sway.
 
         F on node i = k (|d_i| - |rest d_i|) u_i + c (w_i . u_i) u_i,   and the opposite on node i + 1
@@ -182,11 +192,6 @@ class StrandCore:
     smoothing: Array
     here: Array | None = None
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "strands", Indices(self.strands))
-        _tree.store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
-        check_strands("StrandCore", self.strands, self.rest_position)
-
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         nodes = np.asarray(self.strands)
         rest = jnp.diff(self.rest_position, axis=1).astype(position.dtype)
@@ -198,13 +203,6 @@ class StrandCore:
         pull = (self.stiffness * (length - rest_length) + self.damping * approach) * u
         return give_to_ends(pull.astype(position.dtype), self.here, nodes, position)
 
-    def among(self, alive: Array) -> StrandCore:
-        """Only strands that live as a whole."""
-        return _tree.replace(self, here=whole(alive, self.strands, self.rest_position.dtype))
-
-    def check(self, particles: int, dim: int) -> None:
-        check_in_scene("StrandCore", self.strands, particles, dim)
-
 
 def give_to_ends(pull: Array, here: Array | None, nodes: np.ndarray, position: Array) -> Array:
     """Each edge's pull, (strand, edge, 3), to its first node, and the opposite to its second: (particle, 3)."""
@@ -212,10 +210,6 @@ def give_to_ends(pull: Array, here: Array | None, nodes: np.ndarray, position: A
         pull = here.astype(pull.dtype)[:, None, None] * pull
     ends = jnp.pad(pull, ((0, 0), (0, 1), (0, 0))) - jnp.pad(pull, ((0, 0), (1, 0), (0, 0)))
     return jnp.zeros_like(position).at[nodes.reshape(-1)].add(ends.reshape(-1, 3))
-
-
-def whole(alive: Array, strands: Any, dtype: Any) -> Array:
-    return jnp.all(alive[np.asarray(strands)], axis=1).astype(dtype)
 
 
 def check_strands(name: str, strands: Any, rest_position: Array) -> None:
@@ -226,9 +220,3 @@ def check_strands(name: str, strands: Any, rest_position: Array) -> None:
         )
     if rest_position.shape != (*indices.shape, 3):
         raise ValueError(f"{name}.rest_position must have shape {(*indices.shape, 3)}, got {rest_position.shape}")
-
-
-def check_in_scene(name: str, strands: Any, particles: int, dim: int) -> None:
-    check_indices(f"{name}.strands", strands, particles)
-    if dim != 3:
-        raise ValueError(f"{name} needs particles in space, dim 3, got dim {dim}")
