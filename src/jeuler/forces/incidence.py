@@ -36,7 +36,8 @@ def stored(x: Array) -> Array:
     return stored_p.bind(x)
 
 
-def _stored(x):
+def as_stored(x):
+    """The arithmetic of `stored`, for use inside the two maps."""
     return x / jnp.where(x > jnp.inf, 2, 1).astype(x.dtype)
 
 
@@ -64,19 +65,14 @@ def _accumulate_shape(f, *rest, layout):
 
 
 def _difference_jvp(primals, tangents, *, layout):
-    out = difference_p.bind(*primals, layout=layout)
-    if type(tangents[0]) is ad.Zero:
-        return out, [ad.Zero.from_primal_value(x) for x in out]  # type: ignore[attr-defined]
-    return out, difference_p.bind(tangents[0], *primals[1:], layout=layout)
+    return difference_p.bind(*primals, layout=layout), difference_p.bind(tangents[0], *primals[1:], layout=layout)
 
 
 def _accumulate_jvp(primals, tangents, *, layout):
     groups = len(layout.slot_edges)
-    out = accumulate_p.bind(*primals, layout=layout)
-    if all(type(tangent) is ad.Zero for tangent in tangents[:groups]):
-        return out, ad.Zero.from_primal_value(out)  # type: ignore[attr-defined]
     slots = map(ad.instantiate_zeros, tangents[:groups])
-    return out, accumulate_p.bind(*slots, *primals[groups:], layout=layout)
+    tangent = accumulate_p.bind(*slots, *primals[groups:], layout=layout)
+    return accumulate_p.bind(*primals, layout=layout), tangent
 
 
 def _difference_transpose(cotangents, x, *tables, layout):
@@ -127,7 +123,7 @@ def _accumulate_batch(operands, axes, *, layout):
 
 stored_p.def_impl(lambda x: x)
 stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
-mlir.register_lowering(stored_p, mlir.lower_fun(_stored, multiple_results=False))
+mlir.register_lowering(stored_p, mlir.lower_fun(as_stored, multiple_results=False))
 ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])
 batching.defvectorized(stored_p)
 

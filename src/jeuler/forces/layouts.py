@@ -100,7 +100,8 @@ class Shifts(Layout):
 
     def _difference(self, x, *tables):
         n, reach = self.particles, max(self.offsets)
-        x = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(reach, reach)])
+        # a pad alone runs through an older, slower loop of XLA on CPU than one fused with arithmetic: 20 % of the step
+        x = jnp.pad(incidence.as_stored(x), [(0, 0)] * (x.ndim - 1) + [(reach, reach)])
         return [x[..., reach - k : reach + n] - x[..., reach : reach + n + k] for k in self.offsets]
 
     def _accumulate(self, slots, *tables):
