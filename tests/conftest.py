@@ -1,5 +1,6 @@
 """Shared fixtures. Tests run in float64 unless they say float32: ``dtype`` is the fixture for both."""
 
+import gc
 import pathlib
 
 import jax
@@ -7,6 +8,9 @@ import numpy as np
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+
+# What jax keeps of compiled programs is many objects and hardly any of them dies: look for cycles less often.
+gc.set_threshold(100_000, 20, 100)
 
 SHARED = pathlib.Path(__file__).resolve().parent.parent.parent / "shared"
 

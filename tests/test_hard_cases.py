@@ -1,5 +1,7 @@
 """Springs, masses, long runs and long horizons that break simulators: each must be finite and right."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,37 +23,52 @@ def force(part, position, velocity=None):
     return part(0.0, position, jnp.zeros_like(position) if velocity is None else velocity, jnp.asarray(1.0))
 
 
+@functools.cache
+def derivatives_of_linear_springs():
+    """The Jacobian of their force, its derivative, and the Jacobian in reverse mode of a batch."""
+
+    def of(x):
+        return force(springs(), x)
+
+    return jax.jit(jax.jacfwd(of)), jax.jit(jax.jacfwd(jax.jacrev(of))), jax.jit(jax.vmap(jax.jacrev(of)))
+
+
 @DTYPES
 @pytest.mark.parametrize("pair", [(0, 1), (1, 2), (0, 2)])
 def test_coincident_ends_with_rest_length_zero(pair, dtype):
     """Force 0, Jacobian exactly that of linear springs, Hessian 0, for any one pair among many, and vmapped."""
-    position = jnp.array([[0.0, 0.0], [1.0, 0.5], [-2.0, 1.0]], dtype)
-    position = position.at[pair[1]].set(position[pair[0]])
-    laplacian = jnp.array([[2.0, -1.0, -1.0], [-1.0, 2.0, -1.0], [-1.0, -1.0, 2.0]])
-    expected = -7.0 * jnp.einsum("ij,kl->ikjl", laplacian, jnp.eye(2))
-    jacobian = jax.jacfwd(lambda x: force(springs(), x))(position)
-    np.testing.assert_array_equal(jacobian, expected)
-    batch = jnp.stack([position, jnp.zeros_like(position)])
-    np.testing.assert_array_equal(jax.vmap(jax.jacrev(lambda x: force(springs(), x)))(batch), [expected] * 2)
-    second = jax.jacfwd(jax.jacrev(lambda x: force(springs(), x)))(position)
-    np.testing.assert_array_equal(second, 0)
+    position = np.array([[0.0, 0.0], [1.0, 0.5], [-2.0, 1.0]], dtype)
+    position[pair[1]] = position[pair[0]]
+    laplacian = np.array([[2.0, -1.0, -1.0], [-1.0, 2.0, -1.0], [-1.0, -1.0, 2.0]])
+    expected = -7.0 * np.einsum("ij,kl->ikjl", laplacian, np.eye(2))
+    jacobian, second, of_batch = derivatives_of_linear_springs()
+    np.testing.assert_array_equal(jacobian(position), expected)
+    batch = np.stack([position, np.zeros_like(position)])
+    np.testing.assert_array_equal(of_batch(batch), [expected] * 2)
+    np.testing.assert_array_equal(second(position), 0)
+
+
+@functools.cache
+def derivatives_of_a_weighted_force():
+    """The sum of the forces with fixed weights, its gradient with respect to everything, its Hessian in position."""
+
+    def total(part, x, v):
+        return jnp.sum(force(part, x, v) * np.array([[1.0, 2.0], [-3.0, 4.0], [5.0, 6.0]], x.dtype))
+
+    return jax.jit(total), jax.jit(jax.grad(total, argnums=(0, 1, 2))), jax.jit(jax.hessian(total, argnums=1))
 
 
 @DTYPES
 @pytest.mark.parametrize("gap", [0.0, 1e-30, 1e-12])
 def test_coincident_ends_with_rest_length_are_finite(gap, dtype):
     """At r = 0 the direction counts as 0: no force; the gradients with respect to everything are finite."""
-    position = jnp.array([[0.0, 0.0], [gap, 0.0], [1.0, 1.0]], dtype)
-    velocity = jnp.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]], dtype)
-
-    def total(part, x, v):
-        return jnp.sum(force(part, x, v) * jnp.array([[1.0, 2.0], [-3.0, 4.0], [5.0, 6.0]], dtype))
-
+    position = np.array([[0.0, 0.0], [gap, 0.0], [1.0, 1.0]], dtype)
+    velocity = np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]], dtype)
+    value, gradient, hessian = derivatives_of_a_weighted_force()
     part = springs(rest_length=1.0)
-    assert jnp.isfinite(force(part, position, velocity)).all()
-    gradient = jax.grad(total, argnums=(0, 1, 2))(part, position, velocity)
-    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-    assert jnp.isfinite(jax.hessian(lambda x: total(part, x, velocity))(position)).all()
+    assert np.isfinite(value(part, position, velocity))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient(part, position, velocity)))
+    assert np.isfinite(hessian(part, position, velocity)).all()
 
 
 def test_very_stiff_next_to_very_soft():

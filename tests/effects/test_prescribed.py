@@ -71,17 +71,21 @@ def test_samples_are_read_by_scipys_cubic(random):
 
 def test_gradient_through_the_samples():
     times = np.linspace(0, 1, 6)
-    samples = jax.vmap(hand)(jnp.asarray(times))
+    samples = np.asarray(jax.vmap(hand)(jnp.asarray(times)))
 
+    @jax.jit
+    @jax.value_and_grad
     def loss(samples):
         run = jeuler.simulate(rope(jeuler.SampledPath(times, samples)), STATE, dt=0.02, num_steps=50)
         return jnp.sum(run.y.position[-1, 1] ** 2)
 
-    slope = jax.grad(loss)(samples)
+    _, slope = loss(samples)
     h = 1e-6
     for k in (0, 2, 5):
-        bump = jnp.zeros_like(samples).at[k, 0, 0].set(h)
-        np.testing.assert_allclose(slope[k, 0, 0], (loss(samples + bump) - loss(samples - bump)) / (2 * h), rtol=1e-5)
+        bump = np.zeros_like(samples)
+        bump[k, 0, 0] = h
+        (above, _), (below, _) = loss(samples + bump), loss(samples - bump)
+        np.testing.assert_allclose(slope[k, 0, 0], (above - below) / (2 * h), rtol=1e-5)
 
 
 @pytest.mark.parametrize(
