@@ -12,11 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jeuler
-from jeuler.forces import layouts
+from jeuler.forces import layouts, topology
 from jeuler.forces.layouts import Pairs, Rows, Shifts
 from jeuler.forces.topology import Topology
 
 PARTICLES = 30
+
+
+@pytest.fixture(scope="module", autouse=True)
+def rows_for_small_graphs():
+    """So that graphs of 40 edges get the layout of 8,000."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(topology, "MANY", 40)
+        topology._layouts.cache_clear()
+        yield
+    topology._layouts.cache_clear()
 
 
 def lattice(particles=PARTICLES, offsets=(1, 6)):
@@ -38,6 +48,7 @@ def graphs():
         "shifts": (regular, [Shifts]),
         "rows": (anywhere, [Rows]),
         "hub": (hub, [Rows]),
+        "pairs": (anywhere[:30], [Pairs]),
         "shifts and pairs": (np.concatenate([anywhere[:3], regular]), [Shifts, Pairs]),
         "shifts and rows": (np.concatenate([regular, anywhere[:40]]), [Shifts, Rows]),
     }
@@ -160,7 +171,7 @@ def test_every_nesting_of_derivatives_equals_autodiff_of_the_plain_formula(name,
     check_equal(derivatives(spring_force(edges)), derivatives(plain_force(edges)))
 
 
-@pytest.mark.parametrize("name", ["shifts", "rows", "shifts and pairs"])
+@pytest.mark.parametrize("name", ["shifts", "rows", "pairs", "shifts and pairs"])
 def test_a_run_and_its_gradient_equal_a_plain_loop(name, random):
     edges, _ = graphs()[name]
     position, velocity = jnp.asarray(random.normal(size=(2, PARTICLES, 3)))
@@ -190,7 +201,7 @@ def test_a_run_and_its_gradient_equal_a_plain_loop(name, random):
     check_equal(slope(by_jeuler)(*args), slope(by_hand)(*args), 1e-10)
 
 
-def test_the_rule_chooses_by_the_structure_of_the_edges(random):
+def test_the_rule_chooses_by_the_structure_of_the_edges(random, monkeypatch):
     shuffled = random.permutation(400)
     grid = cloth(20)
 
@@ -202,6 +213,10 @@ def test_the_rule_chooses_by_the_structure_of_the_edges(random):
     assert kinds(np.concatenate([grid, [[0, 300]]]), 400) == [Shifts, Pairs]
     assert kinds(np.concatenate([grid, random_edges(random, 200, 400)]), 400) == [Shifts, Rows]
     assert kinds(np.zeros((0, 2), int), 5) == []
+    monkeypatch.setattr(topology, "MANY", len(grid) + 1)
+    topology._layouts.cache_clear()
+    assert kinds(shuffled[grid], 400) == [Pairs]
+    topology._layouts.cache_clear()
 
 
 def test_a_hub_does_not_pad_the_others():

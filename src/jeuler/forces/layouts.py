@@ -7,7 +7,7 @@ B^T adds
 - `Rows`: any graph. Each particle has a row with one slot for each of its edges; both ends hold the edge,
 with
   opposite signs, so that B^T sums a row and needs no look-up, and B gathers only the far ends.
-- `Pairs`: a few edges. Two gathers and two scatters, as one would write it by hand.
+- `Pairs`: a few edges, or few thousand. Two gathers and two scatters, as one would write it by hand.
 
 Slots may be empty; what a force puts there must be 0, which `Layout.to_slots` sees to.
 """
@@ -204,7 +204,12 @@ class Rows(Layout):
 
 
 class Pairs(Layout):
-    """A few edges, as one would write it: a slot an edge, two gathers in B, two scatters in B^T."""
+    """Not many edges, as one would write it: a slot an edge, two gathers in B, two scatters in B^T.
+
+    As many slots as edges, and no padding. Up to some thousand edges, and in batches of such systems, that beats
+    `Rows`: 866 springs of a mesh take 15 instead of 18 ns each, their gradient 44 instead of 58, and in a batch of 32,
+    13 instead of 48 and 68 instead of 245. From 10,000 edges on the scatters cost more than `Rows`' second copies.
+    """
 
     copies = 1
     clean = True

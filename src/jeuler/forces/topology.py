@@ -14,7 +14,8 @@ from jeuler.forces.layouts import Layout, Pairs, Rows, Shifts
 
 MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
 SHIFT_GAIN = 4  # how many slots of Shifts cost what one edge costs in Rows
-FEW = 8  # Pairs for less than one edge in so many particles
+FEW = 8  # Pairs for less than one edge in so many particles,
+MANY = 8000  # and for less than so many edges: their arrays stay in the nearest caches, where scatters are cheap
 
 
 class Topology:
@@ -82,7 +83,8 @@ class Topology:
 
         The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that
         is if there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the
-        commonest first. Of the others, if they are less than one in FEW particles, `Pairs`, else `Rows`.
+        commonest first. Of the others, if they are less than MANY, or less than one in FEW particles, `Pairs`, else
+        `Rows`.
         """
         return _layouts(self, particles)
 
@@ -111,7 +113,7 @@ def _layouts(topology: Topology, particles: int) -> tuple[Layout, ...]:
     if regular.any():
         layouts.append(Shifts(edges[regular], numbers[regular], particles))
     if others.any():
-        kind = Pairs if FEW * np.count_nonzero(others) < particles else Rows
+        kind = Pairs if np.count_nonzero(others) < max(MANY, particles / FEW) else Rows
         layouts.append(kind(edges[others], numbers[others], particles))
     return tuple(layouts)
 
