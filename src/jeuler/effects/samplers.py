@@ -22,7 +22,7 @@ from jeuler.forces.springs import direction
 class Sampler:
     """What the samplers share: ``at(u)``, a smooth function of uniform numbers u, (numbers, count), in [0, 1)."""
 
-    numbers: int | None  # that a particle takes; None where a function of the person's own draws them from a key
+    numbers: Any  # that a particle takes; None where a function of the person's own draws them from a key
 
     def at(self, u: Array) -> Array:
         raise NotImplementedError
@@ -86,8 +86,8 @@ class Uniform(Sampler):
       sect. 2 (attributes drawn at birth).
     """
 
-    low: Array
-    high: Array
+    low: _tree.Parameter
+    high: _tree.Parameter
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "low", "high")
@@ -389,7 +389,7 @@ class Cone(Sampler):
 def standard_normal(u: Array) -> Array:
     """Standard normal numbers of uniform ones in [0, 1): the inverse of the distribution; u = 0 is moved off -inf."""
     above = np.nextafter(np.array(-1, u.dtype), np.array(0, u.dtype))
-    return np.array(np.sqrt(2), u.dtype) * jax.lax.erf_inv(jnp.maximum(2 * u - 1, above))
+    return jnp.asarray(np.sqrt(2), u.dtype) * jax.lax.erf_inv(jnp.maximum(2 * u - 1, above))
 
 
 def frame(axis: Array) -> tuple[Array, Array, Array]:

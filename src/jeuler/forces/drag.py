@@ -14,7 +14,7 @@ from jeuler.forces.air import air_velocity, as_air, check_air
 
 def through_air(air: tuple, t: Any, position: Array, velocity: Array) -> Array:
     """The velocity of each particle relative to the air, (particle, dim)."""
-    return by_component(jnp.subtract, velocity, air_velocity(air, t, position)) if air else velocity
+    return by_component(jnp.subtract, velocity, jnp.asarray(air_velocity(air, t, position))) if air else velocity
 
 
 def unless_too_long(rate: Array, dt: Array) -> Array:
