@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
+from jeuler._components import by_component
 
 # What a particle has in a field that nothing gave a value: (shape of one particle's value, value).
 DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
@@ -202,4 +203,6 @@ def parked(state: ParticleState) -> ParticleState:
         return jnp.where(alive.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
 
     alive = jnp.asarray(state.alive)
-    return jax.tree.map(park, state).replace(mass=state.mass)
+    rest = jax.tree.map(park, _tree.replace(state, position=None, velocity=None, mass=None))
+    position, velocity = (by_component(park, x) for x in (state.position, state.velocity))
+    return _tree.replace(rest, position=position, velocity=velocity, mass=state.mass)

@@ -22,6 +22,7 @@ from jeuler.effects import (
     SpeedLimit,
     Uniform,
 )
+from jeuler.effects.lifecycle import first_free
 from jeuler.forces import LinearDrag, PointAttractor, ShapeMatching, Viscosity
 from jeuler.state import empty_pool
 
@@ -73,6 +74,16 @@ def test_births_that_find_no_slot_are_counted():
     state = births(Emitter(0.0, **POINT, bursts=((0.0, 10),), max_births=4), dt=0.01, num_steps=2)
     assert int(state.births[-1]) == 4
     assert int(state.missed_births[-1]) == 6
+
+
+@pytest.mark.parametrize("capacity", [1, 31, 32, 33, 300])
+def test_the_first_free_slots_are_found(capacity, random):
+    for share in (0.0, 0.1, 0.9, 1.0):
+        alive = random.random(capacity) < share
+        expected = np.flatnonzero(~alive)
+        slots, free = first_free(jnp.asarray(alive), 40)
+        assert int(free) == len(expected)
+        assert np.array_equal(slots[: len(expected)], expected[:40])
 
 
 def test_slots_are_recycled_and_the_pool_holds_what_lives():

@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 from jeuler.effects import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
+from jeuler.effects.samplers import draw_named
 
 KEY, COUNT = jax.random.key(3), 4000
 
@@ -94,3 +95,26 @@ def test_gradients_flow_to_every_parameter(name):
 def test_a_jet_without_spread_has_a_finite_gradient():
     gradient = jax.grad(lambda angle: jnp.sum(Cone([0.0, 0.0, 1.0], 1.0, angle)(KEY, 5)))(0.0)
     assert np.isfinite(gradient)
+
+
+def test_samplers_drawn_together_have_nothing_in_common_and_do_not_change_each_other():
+    def own(key, count):
+        return jax.random.uniform(key, (count,))
+
+    named = {"a": Uniform([0.0, 0.0], 1.0), "b": Uniform([0.0, 0.0], 1.0), "own": own, "same": 3.0}
+    values = draw_named(named, KEY, 500, jnp.float64)
+    assert np.all(values["same"] == 3.0)
+    columns = np.column_stack([values["a"], values["b"], values["own"]])
+    p_values = scipy.stats.spearmanr(columns).pvalue[np.triu_indices(5, 1)]
+    assert p_values.min() > 0.01 / len(p_values)
+    for name, alone in (("b", named["b"]), ("own", own)):
+        assert np.array_equal(draw_named({name: alone}, KEY, 500, jnp.float64)[name], values[name])
+
+
+def test_the_speed_of_a_cone_may_be_a_function_of_the_persons_own():
+    jet = Cone([0.0, 3.0], lambda key, count: 2.0 + jax.random.uniform(key, (count,)), 0.5)
+    v = draw_named({"velocity": jet}, KEY, COUNT, jnp.float64)["velocity"]
+    speed, angle = np.linalg.norm(v, axis=1), np.arctan2(v[:, 0], v[:, 1])
+    assert scipy.stats.kstest(speed - 2, scipy.stats.uniform.cdf).pvalue > 0.01
+    assert scipy.stats.kstest(angle + 0.5, scipy.stats.uniform.cdf).pvalue > 0.01
+    assert scipy.stats.spearmanr(speed, angle).pvalue > 0.01

@@ -1,5 +1,6 @@
 """Pictures and films: what is drawn is what the state says."""
 
+import dataclasses
 import shutil
 import subprocess
 
@@ -88,16 +89,20 @@ def test_what_a_solid_hides_is_not_drawn():
     assert in_sight(ball, 0.0, points, np.array([1.0, 0.0, 0.0]), 8.0).tolist() == [True, False, True, True]
 
 
-def test_a_film_is_written_as_gif_and_html_and_shown_in_a_notebook(tmp_path):
+def test_a_film_is_written_as_gif_and_html_and_shown_in_a_notebook(tmp_path, capsys):
     animate(film(), path=tmp_path / "film.gif", progress=False, title="t = {t} s")
     with Image.open(tmp_path / "film.gif") as image:
         assert image.n_frames == FRAMES
         assert image.size == (480, 360)
-    player = animate(film(3), every=2, progress=False)
+    assert capsys.readouterr().err == "", "no bar where none is wanted"
+    player = animate(film(3), every=2)
     assert player.frames == 2
     html = player._repr_html_()
+    bar = capsys.readouterr().err
+    assert "drawing" in bar
+    assert "2/2" in bar
     assert html.count("data:image/png;base64") == 2
-    player.save(tmp_path / "film.html")
+    dataclasses.replace(player, progress=False).save(tmp_path / "film.html")
     assert (tmp_path / "film.html").stat().st_size == len(html.encode())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +10,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler import _check, _tree
-from jeuler.effects.samplers import as_sampler, draw
+from jeuler._components import by_component
+from jeuler.effects.samplers import Uniform, as_sampler, draw, draw_named
 from jeuler.state import COUNTERS, DEFAULTS
 
 _OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
@@ -118,35 +118,35 @@ class Emitter:
         return (stream + burst).astype(jnp.int32)
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Array) -> Any:
-        capacity, dtype = len(state.position), state.position.dtype
+        capacity = len(state.position)
         block = min(self.max_births or capacity, capacity)
-        free = jnp.cumsum(~state.alive, dtype=jnp.int32)
+        slot, free = first_free(state.alive, block)
         wanted = self.number_of_births(t, dt)
-        births = jnp.minimum(wanted, jnp.minimum(free[-1], block))
-        rank = jnp.arange(block, dtype=jnp.int32)
-        slot = jnp.where(rank < births, jnp.searchsorted(free, rank + 1), capacity)
+        births = jnp.minimum(wanted, jnp.minimum(free, block))
+        slot = jnp.where(jnp.arange(block) < births, slot, capacity)
 
         def put(name: str, x: Array, newborn: Array) -> Array:
             if newborn.shape != (block, *x.shape[1:]):
                 raise ValueError(
                     f"Emitter.{name} must give each newborn a value of shape {x.shape[1:]}, got {newborn.shape[1:]}"
                 )
-            return x.at[slot].set(newborn.astype(x.dtype), mode="drop")
 
-        def sample(name: str, sampler: Any) -> Array:
-            return draw(sampler, jax.random.fold_in(key, zlib.crc32(name.encode())), block)
+            def into(x: Array, newborn: Array) -> Array:
+                return x.at[slot].set(newborn.astype(x.dtype), mode="drop")
 
-        since_step = dt * jax.random.uniform(jax.random.fold_in(key, 0), (block,), dtype)
-        velocity = sample("velocity", self.velocity)
-        position = sample("position", self.position) - since_step[:, None] * velocity
-        values = {name: sample(name, sampler) for name, sampler in self.samplers.items()}
+            return by_component(into, x, newborn) if name in ("position", "velocity") else into(x, newborn)
+
+        named = {"position": self.position, "velocity": self.velocity, **self.samplers}
+        dtype = _tree.time_dtype(state.position)
+        values = draw_named({"moment of birth": Uniform(0.0, 1.0), **named}, key, block, dtype)
+        since_step = dt * values.pop("moment of birth")
+        values["position"] = values["position"] - since_step[:, None] * values["velocity"]
         for name in state.fields():
             if name in DEFAULTS and name not in values:
                 shape, value = DEFAULTS[name]
                 values[name] = jnp.full((block, *shape), value)
         if state.age is not None:
             values["age"] = -since_step
-        values |= {"position": position, "velocity": velocity}
         new = {name: put(name, getattr(state, name), value) for name, value in values.items()}
         return state.replace(**new, births=state.births + births, missed_births=state.missed_births + wanted - births)
 
@@ -165,6 +165,26 @@ class Emitter:
 def step_number(t: Any, dt: Any) -> Array:
     """t / dt to an integer that grows by exactly one a step: rounding puts the edge away from the usual fractions."""
     return jnp.floor(lax.stop_gradient(t / dt) + 0.618)
+
+
+def first_free(alive: Array, count: int) -> tuple[Array, Array]:
+    """The first ``count`` free slots in order, and how many are free in all; past these the slots mean nothing.
+
+    By words of 32 slots, a bit each: the running sum goes over words, not slots, and the n-th bit of a word is found
+    by counting in it.
+    """
+    words = -(-len(alive) // 32)
+    free = jnp.pad(~alive, (0, 32 * words - len(alive))).reshape(words, 32)
+    lane = jnp.arange(32, dtype=jnp.uint32)
+    bits = jnp.sum(free.astype(jnp.uint32) << lane, axis=1, dtype=jnp.uint32)
+    in_word = lax.population_count(bits).astype(jnp.int32)
+    up_to = jnp.cumsum(in_word)
+    rank = jnp.arange(count, dtype=jnp.int32)
+    word = jnp.minimum(jnp.searchsorted(up_to, rank, side="right", method="scan_unrolled"), words - 1)
+    left = rank - (up_to - in_word)[word]  # set bits of this word to pass by
+    up_to_lane = bits[word][:, None] & (jnp.uint32(0xFFFFFFFF) >> (31 - lane))
+    bit = jnp.sum(lax.population_count(up_to_lane).astype(jnp.int32) <= left[:, None], axis=1, dtype=jnp.int32)
+    return 32 * word + bit, up_to[-1]
 
 
 @_tree.component()

@@ -1,11 +1,13 @@
 """Samplers: ``sampler(key, count) -> (count, ...)``, what an `Emitter` draws the attributes of newborns from.
 
-Each is a smooth function of its parameters and of noise that does not depend on them (reparameterised sampling), so
-gradients reach the parameters.
+Each is a smooth function of its parameters and of uniform numbers that do not depend on them (reparameterised
+sampling), so gradients reach the parameters.
 """
 
 from __future__ import annotations
 
+import math
+import zlib
 from typing import Any
 
 import jax
@@ -13,8 +15,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _random, _tree
 from jeuler.forces.springs import direction
+
+
+class Sampler:
+    """What the samplers share: ``at(u)``, a smooth function of uniform numbers u, (numbers, count), in [0, 1)."""
+
+    numbers: Any  # that a particle takes; None where a function of the person's own draws them from a key
+
+    def at(self, u: Array) -> Array:
+        raise NotImplementedError
+
+    def __call__(self, key: Array, count: int) -> Array:
+        return self.at(jax.random.uniform(key, (self.numbers, count), jnp.result_type(*jax.tree.leaves(self))))
+
+
+def numbers_of(sampler: Any) -> int | None:
+    """How many uniform numbers a particle takes: none for a plain value; None where a function draws from a key."""
+    return getattr(sampler, "numbers", None) if callable(sampler) else 0
 
 
 def draw(sampler: Any, key: Array, count: int) -> Array:
@@ -25,13 +44,29 @@ def draw(sampler: Any, key: Array, count: int) -> Array:
     return jnp.broadcast_to(value, (count, *value.shape))
 
 
+def draw_named(samplers: dict[str, Any], key: Array, count: int, dtype: Any) -> dict[str, Array]:
+    """``count`` values of each sampler. What one draws depends on the key and its own name, not on the others."""
+    rows = {name: numbers_of(sampler) or 0 for name, sampler in samplers.items()}
+    named = [zlib.crc32(f"{name} {k}".encode()) for name in rows for k in range(rows[name])]
+    u = _random.uniform_rows(key, named, count, dtype)
+    values, first = {}, 0
+    for name, sampler in samplers.items():
+        if rows[name]:
+            values[name] = sampler.at(u[first : first + rows[name]])
+        else:
+            own_key = jax.random.fold_in(key, zlib.crc32(name.encode()))
+            values[name] = draw(sampler, own_key, count)
+        first += rows[name]
+    return values
+
+
 def as_sampler(x: Any) -> Any:
     """A sampler as a pytree of floating arrays; numbers and arrays become arrays, None stays."""
     return _tree.as_component(x) if callable(x) else _tree.as_float(x)
 
 
 @_tree.component()
-class Uniform:
+class Uniform(Sampler):
     """Uniform between two bounds, each component by itself.
 
         x = low + (high - low) u,   u uniform in [0, 1)
@@ -51,19 +86,23 @@ class Uniform:
       sect. 2 (attributes drawn at birth).
     """
 
-    low: Array
-    high: Array
+    low: _tree.Parameter
+    high: _tree.Parameter
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "low", "high")
 
-    def __call__(self, key: Array, count: int) -> Array:
-        shape, dtype = jnp.broadcast_shapes(self.low.shape, self.high.shape), jnp.result_type(self.low, self.high)
-        return self.low + (self.high - self.low) * jax.random.uniform(key, (count, *shape), dtype)
+    @property
+    def numbers(self) -> int:
+        return math.prod(jnp.broadcast_shapes(self.low.shape, self.high.shape))
+
+    def at(self, u: Array) -> Array:
+        shape = jnp.broadcast_shapes(self.low.shape, self.high.shape)
+        return self.low + (self.high - self.low) * u.T.reshape(-1, *shape)
 
 
 @_tree.component()
-class Normal:
+class Normal(Sampler):
     """Normal (Gaussian), each component by itself.
 
         x = mean + deviation n,   n standard normal
@@ -88,14 +127,17 @@ class Normal:
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "mean", "deviation")
 
-    def __call__(self, key: Array, count: int) -> Array:
+    @property
+    def numbers(self) -> int:
+        return math.prod(jnp.broadcast_shapes(self.mean.shape, self.deviation.shape))
+
+    def at(self, u: Array) -> Array:
         shape = jnp.broadcast_shapes(self.mean.shape, self.deviation.shape)
-        dtype = jnp.result_type(self.mean, self.deviation)
-        return self.mean + self.deviation * jax.random.normal(key, (count, *shape), dtype)
+        return self.mean + self.deviation * standard_normal(u).T.reshape(-1, *shape)
 
 
 @_tree.component()
-class Choice:
+class Choice(Sampler):
     """One of the rows of a table, each as likely: a palette of colours, a set of sizes.
 
     Args:
@@ -116,12 +158,15 @@ class Choice:
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "values")
 
-    def __call__(self, key: Array, count: int) -> Array:
-        return self.values[jax.random.randint(key, (count,), 0, len(self.values))]
+    numbers = 1
+
+    def at(self, u: Array) -> Array:
+        row = (u[0] * len(self.values)).astype(jnp.int32)
+        return self.values[jnp.minimum(row, len(self.values) - 1)]  # the product may round up
 
 
 @_tree.component()
-class FromLine:
+class FromLine(Sampler):
     """Uniform on a line segment.
 
         x = start + (end - start) u
@@ -147,12 +192,14 @@ class FromLine:
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "start", "end")
 
-    def __call__(self, key: Array, count: int) -> Array:
-        return self.start + (self.end - self.start) * jax.random.uniform(key, (count, 1), self.start.dtype)
+    numbers = 1
+
+    def at(self, u: Array) -> Array:
+        return self.start + (self.end - self.start) * u.T
 
 
 @_tree.component()
-class FromDisc:
+class FromDisc(Sampler):
     """Uniform on a disc: in the plane, or in space across a normal.
 
         x = center + radius sqrt(u) (cos a, sin a)
@@ -180,8 +227,9 @@ class FromDisc:
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "center", "radius", "normal")
 
-    def __call__(self, key: Array, count: int) -> Array:
-        u = jax.random.uniform(key, (2, count), self.center.dtype)
+    numbers = 2
+
+    def at(self, u: Array) -> Array:
         r, angle = self.radius * jnp.sqrt(u[0]), 2 * jnp.pi * u[1]
         x, y = (r * jnp.cos(angle))[:, None], (r * jnp.sin(angle))[:, None]
         if len(self.center) == 2:
@@ -191,7 +239,7 @@ class FromDisc:
 
 
 @_tree.component(static=("surface",))
-class FromSphere:
+class FromSphere(Sampler):
     """Uniform in a ball, or on its surface, in any dimension.
 
         x = center + radius u^(1/dim) n / |n|,   n standard normal
@@ -218,16 +266,19 @@ class FromSphere:
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "center", "radius")
 
-    def __call__(self, key: Array, count: int) -> Array:
-        for_direction, for_radius = jax.random.split(key)
-        dim, dtype = len(self.center), self.center.dtype
-        _, n = direction(jax.random.normal(for_direction, (count, dim), dtype))
-        share = 1.0 if self.surface else jax.random.uniform(for_radius, (count, 1), dtype) ** (1 / dim)
+    @property
+    def numbers(self) -> int:
+        return len(self.center) + (not self.surface)
+
+    def at(self, u: Array) -> Array:
+        dim = len(self.center)
+        _, n = direction(standard_normal(u[:dim]).T)
+        share = 1.0 if self.surface else u[dim:].T ** (1 / dim)
         return self.center + self.radius * share * n
 
 
 @_tree.component(static=("faces",))
-class FromSurface:
+class FromSurface(Sampler):
     """Uniform on a surface of triangles (in space or in the plane).
 
         x = a + s (b - a) + q (c - a),   a triangle (a, b, c) drawn by its area
@@ -260,19 +311,21 @@ class FromSurface:
             )
         object.__setattr__(self, "faces", tuple(map(tuple, faces.tolist())))
 
-    def __call__(self, key: Array, count: int) -> Array:
-        for_face, for_place = jax.random.split(key)
+    numbers = 3
+
+    def at(self, u: Array) -> Array:
         a, b, c = (self.vertices[np.array(self.faces)[:, k]] for k in range(3))
         ab, ac = b - a, c - a
         square = jnp.sum(ab**2, -1) * jnp.sum(ac**2, -1) - jnp.sum(ab * ac, -1) ** 2  # 4 area^2
-        face = jax.random.categorical(for_face, jnp.log(jax.lax.stop_gradient(square)) / 2, shape=(count,))
-        u = jax.random.uniform(for_place, (2, count, 1), a.dtype)
-        s, q = jnp.where(u.sum(axis=0) > 1, 1 - u, u)  # the far half of the parallelogram folds back
+        up_to = jnp.cumsum(jnp.sqrt(jax.lax.stop_gradient(square)))
+        face = jnp.searchsorted(up_to[:-1], u[0] * up_to[-1], side="right")
+        place = u[1:, :, None]
+        s, q = jnp.where(place.sum(axis=0) > 1, 1 - place, place)  # the far half of the parallelogram folds back
         return a[face] + s * ab[face] + q * ac[face]
 
 
 @_tree.component()
-class Cone:
+class Cone(Sampler):
     """Velocities in a cone: directions uniform in the solid angle about an axis, speeds from a sampler.
 
         v = speed (cos b axis + sin b side)
@@ -302,11 +355,24 @@ class Cone:
         _tree.store_as_float(self, "direction", "angle")
         object.__setattr__(self, "speed", as_sampler(self.speed))
 
+    @property
+    def numbers(self) -> int | None:
+        for_speed = numbers_of(self.speed)
+        return None if for_speed is None else 2 + for_speed
+
     def __call__(self, key: Array, count: int) -> Array:
+        if self.numbers is not None:
+            return super().__call__(key, count)
         for_speed, for_angle = jax.random.split(key)
-        dtype = self.direction.dtype
-        speed = draw(self.speed, for_speed, count).reshape(-1, 1)
-        u = jax.random.uniform(for_angle, (2, count, 1), dtype)
+        u = jax.random.uniform(for_angle, (2, count), self.direction.dtype)
+        return self.along(u, self.speed(for_speed, count))
+
+    def at(self, u: Array) -> Array:
+        return self.along(u[:2], self.speed.at(u[2:]) if callable(self.speed) else self.speed)
+
+    def along(self, u: Array, speed: Array) -> Array:
+        """Velocities of these speeds, in directions drawn by two uniform numbers each."""
+        u, speed = u[..., None], speed.reshape(-1, 1)
         if len(self.direction) == 2:
             _, axis = direction(self.direction)
             side = jnp.stack([-axis[1], axis[0]])
@@ -318,6 +384,12 @@ class Cone:
         sine = jnp.sqrt(u[0]) * 2 * jnp.sin(self.angle / 2) * jnp.sqrt(1 - down / 2)
         around = 2 * jnp.pi * u[1]
         return speed * ((1 - down) * axis + sine * (jnp.cos(around) * first + jnp.sin(around) * second))
+
+
+def standard_normal(u: Array) -> Array:
+    """Standard normal numbers of uniform ones in [0, 1): the inverse of the distribution; u = 0 is moved off -inf."""
+    above = np.nextafter(np.array(-1, u.dtype), np.array(0, u.dtype))
+    return jnp.asarray(np.sqrt(2), u.dtype) * jax.lax.erf_inv(jnp.maximum(2 * u - 1, above))
 
 
 def frame(axis: Array) -> tuple[Array, Array, Array]:

@@ -8,8 +8,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler import _tree
+from jeuler._components import by_component, split
 from jeuler.forces.air import air_velocity, as_air, check_air
-from jeuler.forces.fields import per_particle
+
+
+def through_air(air: tuple, t: Any, position: Array, velocity: Array) -> Array:
+    """The velocity of each particle relative to the air, (particle, dim)."""
+    return by_component(jnp.subtract, velocity, jnp.asarray(air_velocity(air, t, position))) if air else velocity
 
 
 def unless_too_long(rate: Array, dt: Array) -> Array:
@@ -56,11 +61,10 @@ class LinearDrag:
         object.__setattr__(self, "air", as_air(self.air))
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        relative = velocity - air_velocity(self.air, t, position)
-        c = per_particle(self.coefficient.astype(position.dtype))
+        c = self.coefficient.astype(position.dtype)
         if self.longest_step is not None:
-            c = c * unless_too_long(c / per_particle(mass), self.longest_step)
-        return -c * relative
+            c = c * unless_too_long(c / mass, self.longest_step)
+        return by_component(lambda u: -c * u, through_air(self.air, t, position, velocity))
 
     def for_step(self, dt: Array) -> LinearDrag:
         return _tree.replace(self, longest_step=dt)
@@ -104,14 +108,14 @@ class QuadraticDrag:
         object.__setattr__(self, "air", as_air(self.air))
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        relative = velocity - air_velocity(self.air, t, position)
-        square = jnp.sum(relative * relative, axis=-1, keepdims=True)
+        relative = through_air(self.air, t, position, velocity)
+        square = sum(u * u for u in split(relative))
         moving = square > 0
         speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1)), 0)
-        c = per_particle(self.coefficient.astype(position.dtype))
+        c = self.coefficient.astype(position.dtype)
         if self.longest_step is not None:
-            c = c * unless_too_long(c * speed / per_particle(mass), self.longest_step)
-        return -c * speed * relative
+            c = c * unless_too_long(c * speed / mass, self.longest_step)
+        return by_component(lambda u: -c * speed * u, relative)
 
     def for_step(self, dt: Array) -> QuadraticDrag:
         return _tree.replace(self, longest_step=dt)

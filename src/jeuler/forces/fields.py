@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler import _tree
+from jeuler._components import stack
 
 
 def per_particle(x: Array) -> Array:
@@ -42,8 +43,8 @@ class Gravity:
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         weight = jnp.where(jnp.isfinite(mass), mass, 0)
-        force = per_particle(weight) * self.acceleration.astype(position.dtype)
-        return jnp.broadcast_to(force, position.shape)
+        weight = jnp.broadcast_to(weight, position.shape[:1])
+        return stack([weight * g for g in self.acceleration.astype(position.dtype)])
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy -sum_i m_i g.p_i, J."""
