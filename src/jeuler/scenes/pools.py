@@ -44,16 +44,12 @@ def smoke_column() -> Setup:
         return (6.0 * jnp.exp(-age / 1.2))[:, None] * jnp.array([0.0, 0.0, 1.0], position.dtype)
 
     fire = Emitter(
-        rate=900.0,
-        position=FromDisc([0.0, 0.0, 0.0], radius=0.22),
-        velocity=Normal([0.0, 0.0, 0.5], 0.15),
-        lifetime=Uniform(2.5, 4.0),
-        max_births=40,
-    )
+        rate=900.0, position=FromDisc([0.0, 0.0, 0.0], radius=0.22), velocity=Normal([0.0, 0.0, 0.5], 0.15),
+        lifetime=Uniform(2.5, 4.0), max_births=40,
+    )  # fmt: skip
     air = (Vortex([0.0, 0.0, 0.0], circulation=5.0, core=0.5), turbulence(dim=3, speed=0.45, size=0.35, time=0.8))
-    glow = OverLife(
-        "color", [[1.0, 0.75, 0.3], [0.85, 0.35, 0.15], [0.35, 0.33, 0.33], [0.75, 0.75, 0.77]], [0.0, 0.12, 0.3, 1.0]
-    )
+    embers, ash = [[1.0, 0.75, 0.3], [0.85, 0.35, 0.15]], [[0.35, 0.33, 0.33], [0.75, 0.75, 0.77]]
+    glow = OverLife("color", embers + ash, times=[0.0, 0.12, 0.3, 1.0])
     fade = OverLife("opacity", [0.5, 0.3, 0.0], times=[0.0, 0.3, 1.0])
     spread = OverLife("size", [0.06, 0.16, 0.5], times=[0.0, 0.3, 1.0])
     scene = Scene((buoyancy, LinearDrag(2.0, air=air)), (fire, Lifetime(), glow, fade, spread))
@@ -76,13 +72,9 @@ def rain_on_pegs(rows: int = 9, spacing: float = 0.2) -> Setup:
 
     top = (rows + 2) * spacing
     cloud = Emitter(
-        rate=400.0,
-        position=FromLine([-0.03, top], [0.03, top]),
-        velocity=Normal([0.0, -0.5], 0.1),
-        color=Uniform([0.1, 0.3, 0.6], [0.3, 0.6, 0.95]),
-        size=0.024,
-        max_births=4,
-    )
+        rate=400.0, position=FromLine([-0.03, top], [0.03, top]), velocity=Normal([0.0, -0.5], 0.1),
+        color=Uniform([0.1, 0.3, 0.6], [0.3, 0.6, 0.95]), size=0.024, max_births=4,
+    )  # fmt: skip
     contact = Collisions((pegs,), radius=0.012, restitution=0.35, friction=0.05)
     scene = Scene((Gravity([0.0, -9.81]), LinearDrag(1.5)), (cloud, DeathOutside([-2.0, -0.5], [2.0, 4.0]), contact))
     camera = {"center": [0.0, 1.1], "width": 3.2}
