@@ -66,7 +66,7 @@ def program(scene, state, *, save_every=25, windows=()):
             births = zero if state.births is None else state.births
             missed = zero if state.missed_births is None else state.missed_births
             alive = zero + len(state.position) if state.alive is None else state.alive.sum()
-            # something of the motion, or the compiler would leave it out; not a sum over 200,000 slots, which takes 1 ms
+            # something of the motion, or the compiler would leave it out; no sum over 200,000 slots, which takes 1 ms
             seen = state.position[:64].sum() + state.opacity[:64].sum()
             return births, missed, alive, seen
 
