@@ -109,5 +109,5 @@ def works(small: bool) -> list[Work]:
         free(100_000, 30),
     ]
     if not small:
-        chosen += [cloth(256, 10), cloth(512, 5), mesh(10_000, 100), mesh(1_000_000, 4)]
+        chosen += [cloth(256, 20), cloth(512, 20), mesh(10_000, 100), mesh(1_000_000, 6)]
     return chosen

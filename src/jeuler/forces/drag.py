@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler import _tree
-from jeuler._components import by_component, split
+from jeuler._components import by_component, split, stack
 from jeuler.forces.air import air_velocity, as_air, check_air
 
 
@@ -108,14 +108,14 @@ class QuadraticDrag:
         object.__setattr__(self, "air", as_air(self.air))
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        relative = through_air(self.air, t, position, velocity)
-        square = sum(u * u for u in split(relative))
+        relative = split(through_air(self.air, t, position, velocity))
+        square = sum(u * u for u in relative)
         moving = square > 0
         speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1)), 0)
         c = self.coefficient.astype(position.dtype)
         if self.longest_step is not None:
             c = c * unless_too_long(c * speed / mass, self.longest_step)
-        return by_component(lambda u: -c * speed * u, relative)
+        return stack([-c * speed * u for u in relative])  # of one split, or gradients would be (particle, dim)
 
     def for_step(self, dt: Array) -> QuadraticDrag:
         return _tree.replace(self, longest_step=dt)
