@@ -108,8 +108,7 @@ PROBLEMS = [
 
 @pytest.mark.parametrize("number", range(len(PROBLEMS)))
 def test_runs_blow_up_within_five_percent_of_the_limit(number):
-    """A perturbation of 1e-8 of the rest state stays as small at 0.95 of the limit, and grows at 1.05 of
-    it."""
+    """A perturbation of 1e-8 of the rest state stays as small at 0.95 of the limit, and grows at 1.05 of it."""
     f, y, args, step = PROBLEMS[number]
     limit = stability_limit(f, 0.0, y, args, step=step)
     leaves, tree = jax.tree.flatten(y)

@@ -258,9 +258,7 @@ def _report(
         "samples": int(np.isfinite(measured.positions).sum()),
         "mass": mass.tolist(),
         "springs": springs,
-        "modes": [
-            {"natural_frequency": m.angular_frequency, "damping_ratio": m.damping_ratio} for m in _modes(found)
-        ],
+        "modes": [{"natural_frequency": m.angular_frequency, "damping_ratio": m.damping_ratio} for m in _modes(found)],
         "rms": rms,
         "amplitude": amplitude,
         "share_of_amplitude": rms / amplitude if amplitude else 0.0,

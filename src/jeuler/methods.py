@@ -145,9 +145,7 @@ RK4 = Tableau(
 )
 
 
-def runge_kutta_increment(
-    tableau: Tableau, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any
-) -> PyTree:
+def runge_kutta_increment(tableau: Tableau, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
     """dt sum_i b_i k_i with k_i = f(t + c_i dt, y + dt sum_j a_ij k_j, args)."""
     slopes: list[PyTree] = []
     for node, row in zip(tableau.nodes, tableau.matrix, strict=True):

@@ -1,5 +1,4 @@
-"""Work-precision tables: errors against exact solutions, orders, floors, gradients, rows that failed, the
-figure."""
+"""Work-precision tables: errors against exact solutions, orders, floors, gradients, rows that failed, the figure."""
 
 import csv
 import math

@@ -1,5 +1,4 @@
-"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given
-times."""
+"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given times."""
 
 from __future__ import annotations
 
@@ -198,15 +197,11 @@ def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
     return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
 
 
-def evaluations(
-    plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree
-) -> list[Callable]:
-    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps
-    are taken.
+def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[Callable]:
+    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps are taken.
 
-    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and
-    scaled to the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not
-    counted.
+    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and scaled to
+    the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not counted.
     """
 
     def counter(make_run: Callable) -> Callable:

@@ -133,9 +133,7 @@ def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
 class _Step:
     """One step of length dt from t0, for one `Collisions`."""
 
-    def __init__(
-        self, contact: Collisions, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None
-    ) -> None:
+    def __init__(self, contact: Collisions, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None) -> None:
         self.t0, self.dt = t0.astype(x.dtype), dt.astype(x.dtype)
         self.colliders = contact.colliders
         self.restitution = contact.restitution.astype(x.dtype)

@@ -65,9 +65,7 @@ class PenaltyContact:
         for name, shapes in (("ks", ((),)), ("kd", ((),)), ("radius", ((), (particles,)))):
             shape = getattr(self, name).shape
             if shape not in shapes:
-                raise ValueError(
-                    f"PenaltyContact.{name} must have shape {' or '.join(map(str, shapes))}, got {shape}"
-                )
+                raise ValueError(f"PenaltyContact.{name} must have shape {' or '.join(map(str, shapes))}, got {shape}")
         for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("radius", "m")):
             _check.not_negative(f"PenaltyContact.{name}", getattr(self, name), unit)
         check_collider(self.collider, dim)

@@ -17,8 +17,7 @@ from jeuler.forces.topology import Topology
 
 
 def direction(d: Array) -> tuple[Array, Array]:
-    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r =
-    0.
+    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r = 0.
 
     Ends closer than tiny^(1/3) (2e-13 in float32, 3e-103 in float64) count as coincident: below that, the
     second derivative of r overflows.
@@ -72,17 +71,14 @@ class Springs:
         d = p_i - p_j,  r = |d|,  u = d / r
         F_i = ks (L - r) u - kd ((v_i - v_j).u) u,   F_j = -F_i
 
-    At r = 0 the direction u is taken as 0: the force is finite, and with L = 0 it is 0 with derivative
-    exactly -ks I.
+    At r = 0 the direction u is taken as 0: the force is finite, and with L = 0 it is 0 with derivative exactly -ks I.
 
     Args:
-      edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May
-        be empty.
+      edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May be empty.
       ks: stiffness of each spring, shape () or (spring,), N/m. Differentiable.
       kd: damping of each spring, shape () or (spring,), N s/m. Differentiable.
       rest_length: L, length without force, shape () or (spring,), m. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim),
-      N.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in
       `simulate`, if an index is out of range, a parameter has another shape, or one that is not traced is negative.
     Example:
@@ -107,8 +103,7 @@ class Springs:
         return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
 
     def prepare(self, particles: int, dtype: Any) -> PreparedSprings:
-        """The same force with its parameters laid out for the kernels, which is the same work at every
-        step."""
+        """The same force with its parameters laid out for the kernels, which is the same work at every step."""
         layouts = self.edges.layouts(particles)
         parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
         slots = ([layout.to_slots(x) for layout in layouts] for x in parameters)
@@ -143,8 +138,7 @@ class Springs:
 
 @_tree.component(static=("edges", "layouts"))
 class PreparedSprings:
-    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and
-    group."""
+    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and group."""
 
     edges: Topology
     layouts: tuple[Layout, ...]

@@ -20,9 +20,11 @@ FEW = 8  # Pairs for less than one edge in so many particles
 class Topology:
     """The edges of a scene, fixed while tracing: hashable and equal by content, read as an integer array.
 
-    The signed incidence operator B takes a value at each particle to its difference along each edge,
-    (B x)_e = x_i - x_j for e = (i, j). Its transpose sums what each edge gives to its two ends, +f at i and
-    -f at j.
+    The signed incidence operator B takes a value at each particle to its difference along each edge e = (i, j),
+
+        (B x)_e = x_i - x_j
+
+    Its transpose sums what each edge gives to its two ends, +f at i and -f at j.
     """
 
     def __init__(self, edges: Any) -> None:
@@ -80,9 +82,9 @@ class Topology:
     def layouts(self, particles: int) -> tuple[Layout, ...]:
         """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
 
-        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that
-        is if there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the
-        commonest first. Of the others, if they are less than one in FEW particles, `Pairs`, else `Rows`.
+        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
+        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. Of
+        the others, if they are less than one in FEW particles, `Pairs`, else `Rows`.
         """
         return _layouts(self, particles)
 
