@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler import _tree
-from jeuler.forces.neighbours import Indices, check_indices
 from jeuler.forces.springs import direction
+from jeuler.forces.topology import Indices, check_indices
 
 
 def strand_edges(strands: Any) -> np.ndarray:

@@ -10,7 +10,7 @@ from jax import Array
 
 from jeuler import _tree
 from jeuler.forces.springs import direction
-from jeuler.forces.topology import Topology
+from jeuler.forces.topology import Indices, Topology, check_indices
 
 
 @_tree.component(static=("edges",))
@@ -155,32 +155,3 @@ def angle_from(e: Array, f: Array, cosine: Array) -> tuple[Array, Array, Array]:
     theta = jnp.where(bent, jnp.atan2(sine, cosine), jnp.where(cosine > 0, 0, jnp.pi))
     ratio = jnp.where(bent, theta / sine, jnp.where(cosine > 0, 1 + square / 6, 0))
     return theta, ratio, jnp.where(bent, 1 / sine, 0)
-
-
-class Indices:
-    """Fixed particle indices, as part of the program: hashable and equal by content."""
-
-    def __init__(self, indices: Any) -> None:
-        self.indices = np.array(indices, np.int32)
-        self.indices.setflags(write=False)
-        self._key = (self.indices.shape, self.indices.tobytes())
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Indices) and self._key == other._key
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.indices, dtype=dtype)
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-
-def check_indices(name: str, indices: Any, particles: int) -> None:
-    indices = np.asarray(indices)
-    if indices.size and not 0 <= indices.min() <= indices.max() < particles:
-        raise ValueError(
-            f"{name} must be particle indices from 0 to {particles - 1}, got from {indices.min()} to {indices.max()}"
-        )

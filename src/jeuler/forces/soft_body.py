@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jeuler import _tree
-from jeuler.forces.neighbours import Indices, check_indices
+from jeuler.forces.topology import Indices, check_indices
 
 
 @jax.custom_jvp
