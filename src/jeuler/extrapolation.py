@@ -48,7 +48,7 @@ class ExtrapolatedStep:
         columns = jax.tree.map(aitken_neville, rows)
         pick = lambda which: jax.tree.map(lambda _, pair: pair[which], y, columns)  # noqa: E731
         best, before = pick(0), pick(1)
-        return best, jax.tree.map(lambda a, b: a - b, best, before)
+        return best, _tree.subtract(best, before)
 
     def rows(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
         """Increments over dt of the base step in 1, 2, ..., k substeps, with leading axis row.
@@ -75,7 +75,7 @@ class ExtrapolatedStep:
         return jax.tree.map(lambda h: h[lanes.end, lanes.lane], history)
 
     def _difference(self, f, t, y, dt, args):
-        return jax.tree.map(lambda a, b: a - b, self.base(f, t, y, dt, args), y)
+        return _tree.subtract(self.base(f, t, y, dt, args), y)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, Literal
 
@@ -74,8 +75,7 @@ def stability_limit(
     """
     if growing not in ("unstable", "skip"):
         raise ValueError(f'growing must be "unstable" or "skip", got {growing!r}')
-    if any(map(_check.is_traced, jax.tree.leaves((t, y, args)))):
-        raise ValueError("stability_limit must be called with values, got traced ones; call it outside jit, grad, vmap")
+    _check.untraced("stability_limit", t, y, args)
     _check.number("t", t)
     y = _check.state("y", y)
     _check.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
@@ -90,26 +90,16 @@ class Linearisation:
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
         self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # the data's own roundoff
         y, args = cast(y, np.float64), cast(args, np.float64)
-        structure: Any
-        leaves, structure = jax.tree.flatten(y)
-        split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
-        self.complex = any(isinstance(part, tuple) for part in split)
-        self.flat, restore = ravel_pytree(split)  # complex numbers as pairs of real ones
-
-        def unflatten(flat):
-            parts = [jax.lax.complex(*part) if isinstance(part, tuple) else part for part in restore(flat)]
-            return jax.tree.unflatten(structure, parts)
+        self.complex = any(map(jnp.iscomplexobj, jax.tree.leaves(y)))
+        self.flat, self.unflatten = _tree.real_vector(y)
 
         def real_field(t, flat):
-            slopes = structure.flatten_up_to(f(t, unflatten(flat), args))
-            pairs = zip(slopes, split, strict=True)
-            parts = [(jnp.real(s), jnp.imag(s)) if isinstance(part, tuple) else s for s, part in pairs]
-            return ravel_pytree(parts)[0].astype(flat.dtype)
+            slope = f(t, self.unflatten(flat), args)
+            return _tree.real_vector(_tree.in_dtypes_of(y, slope))[0]
 
         def product(t, flat, u):
             return jax.jvp(lambda flat: real_field(t, flat), (flat,), (u,))[1]
 
-        self.unflatten = unflatten
         self.product = jax.jit(product)
         self.products = jax.jit(jax.vmap(product, in_axes=(None, None, 1), out_axes=1))
 
@@ -130,14 +120,14 @@ class Linearisation:
         chosen = np.resize(np.flatnonzero(counts), rates.size)
         rates, modes = rates[chosen], modes[:, chosen]
         rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
-        if treats_all_alike(step):  # type: ignore[arg-type]
-            limit = float(np.min(scalar_limits(step, rates)))
-            bound = limit if math.isinf(interval) else float(np.min(scalar_limits(step, rates, interval)))
-            return limit, max(limit, bound)
-        stiffness, damping = self.modal(t, flat, rates, modes)
-        limit = float(np.min(pair_limits(step, stiffness, damping)))
-        bound = limit if math.isinf(interval) else float(np.min(pair_limits(step, stiffness, damping, interval)))
-        return (limit if matrix is None else self.refined(step, matrix, limit)), max(limit, bound)
+        alike = treats_all_alike(step)  # type: ignore[arg-type]
+        if alike:
+            limits = functools.partial(scalar_limits, step, rates)
+        else:
+            limits = functools.partial(pair_limits, step, *self.modal(t, flat, rates, modes))
+        limit = float(np.min(limits()))
+        bound = limit if math.isinf(interval) else max(limit, float(np.min(limits(interval=interval))))
+        return (limit if alike or matrix is None else self.refined(step, matrix, limit)), bound
 
     def eigen(self, t: Any, flat: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is small."""

@@ -200,3 +200,8 @@ def test_it_refuses_what_it_cannot_look_into(shared):
 def test_bad_input_is_told(change, message):
     with pytest.raises(ValueError, match=message):
         advise_step(lambda t, y, args: -y, 1.0, **({"t1": 1.0, "error": 1e-2} | change))
+
+
+def test_traced_values_are_told():
+    with pytest.raises(ValueError, match="advise_step must be called with values, got traced ones"):
+        jax.jit(lambda t1: advise_step(lambda t, y, args: -y, 1.0, t1=t1, error=1e-2))(1.0)

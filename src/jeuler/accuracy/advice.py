@@ -105,13 +105,9 @@ def advise_step(
       Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
     y0 = _check.state("y0", y0)
-    for name, value in (("t0", t0), ("t1", t1)):
-        _check.number(name, value)
-    if not float(t1) > float(t0):
-        raise ValueError(f"t1 must be later than t0={float(t0):g}, got {float(t1):g}")
+    _check.untraced("advise_step", y0, args, t0, t1, error)
+    t0, t1 = _check.interval(t0, t1)
     _check.positive("error", error)
-    if any(map(_check.is_traced, jax.tree.leaves((y0, args)))):
-        raise ValueError("advise_step must be called with values, got traced ones; call it outside jit, grad, vmap")
     _check.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if max_pilot_steps is None:
         max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))
@@ -119,8 +115,8 @@ def advise_step(
     search = Search(
         f,
         y0,
-        float(t0),
-        float(t1),
+        t0,
+        t1,
         args,
         step,
         float(error),

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler import _tree
 from jeuler.accuracy.timing import counting
 from jeuler.adaptive import solve_adaptive
 from jeuler.extrapolation import ExtrapolatedStep
@@ -102,7 +103,7 @@ class FixedRun:
         if is_diffrax(self.method):
             import diffrax
 
-            times = jnp.asarray(self.times, _time_dtype(y0))
+            times = jnp.asarray(self.times, _tree.time_dtype(y0))
             return _diffrax(
                 f,
                 y0,
@@ -162,7 +163,7 @@ class AdaptiveRun:
         import diffrax
 
         controller = diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance)
-        times = jnp.asarray(self.times, _time_dtype(y0))
+        times = jnp.asarray(self.times, _tree.time_dtype(y0))
         return _diffrax(f, y0, args, self.method, times, None, controller, MOST_ADAPTIVE_STEPS, adjoint)
 
 
@@ -185,10 +186,6 @@ def _diffrax(f, y0, args, solver, times, dt0, controller, most, adjoint):
     )
     failed = jnp.where(run.result == diffrax.RESULTS.successful, -1, run.stats["num_steps"])
     return run.ys, failed, run.stats["num_steps"]
-
-
-def _time_dtype(y0: PyTree) -> Any:
-    return np.result_type(np.float32, *(np.finfo(leaf.dtype).dtype for leaf in jax.tree.leaves(y0)))
 
 
 def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:

@@ -98,7 +98,8 @@ def work_precision(
     from tqdm.auto import tqdm
 
     y0 = _check.state("y0", y0)
-    t0, t1 = _checked_interval(t0, t1)
+    _check.untraced("work_precision", y0, args, t0, t1)
+    t0, t1 = _check.interval(t0, t1)
     dts = _positive_values("dts", dts, "s")
     tolerances = _positive_values("tolerances", tolerances)
     repeats = _check.count("repeats", repeats, least=1)
@@ -211,14 +212,6 @@ def _limit(method: Any, f: VectorField, t0: float, y0: PyTree, args: PyTree) -> 
         np.linalg.LinAlgError,
     ):  # a Jacobian that is not finite, a step that is not linear
         return math.nan
-
-
-def _checked_interval(t0: Any, t1: Any) -> tuple[float, float]:
-    _check.number("t0", t0)
-    _check.number("t1", t1)
-    if not float(t1) > float(t0):
-        raise ValueError(f"t1 must be later than t0={float(t0):g}, got {float(t1):g}")
-    return float(t0), float(t1)
 
 
 def _positive_values(name: str, values: Any, unit: str = "") -> list[float]:
