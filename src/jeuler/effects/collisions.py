@@ -56,7 +56,9 @@ class Collisions:
 
     def __post_init__(self) -> None:
         if not isinstance(self.colliders, (tuple, list)):
-            raise ValueError(f"colliders must be a tuple, got {type(self.colliders).__name__}; write (collider,)")
+            raise ValueError(
+                f"Collisions.colliders must be a tuple, got {type(self.colliders).__name__}; write (collider,)"
+            )
         object.__setattr__(self, "colliders", tuple(_tree.as_component(c) for c in self.colliders))
         object.__setattr__(self, "pairs", _pairs(self.pairs))
         _check.count("max_bounces", self.max_bounces, least=1)
@@ -64,7 +66,7 @@ class Collisions:
         for name, most in (("radius", np.inf), ("restitution", 1.0), ("friction", np.inf)):
             value = getattr(self, name)
             if not _check.is_traced(value) and not bool(jnp.all((value >= 0) & (value <= most))):
-                raise ValueError(f"{name} must be from 0 to {most}, got {value}")
+                raise ValueError(f"Collisions.{name} must be from 0 to {most}, got {value}")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         before = dataclasses.replace(state, position=state.position - dt * state.velocity)
@@ -97,7 +99,9 @@ def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
     if array.size == 0:
         return ()
     if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"pairs must be integers of shape (pair, 2), got {array.dtype} of shape {array.shape}")
+        raise ValueError(
+            f"Collisions.pairs must be integers of shape (pair, 2), got {array.dtype} of shape {array.shape}"
+        )
     if (array < 0).any() or (array[:, 0] == array[:, 1]).any():
-        raise ValueError(f"pairs must join two different particles, indices from 0, got {array.tolist()}")
+        raise ValueError(f"Collisions.pairs must join two different particles, indices from 0, got {array.tolist()}")
     return tuple((int(i), int(j)) for i, j in array)

@@ -41,11 +41,14 @@ class SampledPath:
         times = self.times
         if times.ndim != 1 or len(times) < 2 or len(self.positions) != len(times):
             raise ValueError(
-                f"times must have shape (sample,) with two samples at least and positions (sample, ...), "
+                f"SampledPath.times must have shape (sample,) with two samples at least and positions (sample, ...), "
                 f"got {times.shape} and {self.positions.shape}"
             )
         if not _check.is_traced(times) and not (np.diff(np.asarray(times)) > 0).all():
-            raise ValueError("times must increase from sample to sample; sort the samples and drop repeated times")
+            raise ValueError(
+                f"SampledPath.times must increase from sample to sample, got {times.tolist()}; "
+                f"sort the samples and drop repeated times"
+            )
 
     def __call__(self, t: Any) -> Array:
         return interpolate(t, self.times, self.positions, slopes(self.times, self.positions))
