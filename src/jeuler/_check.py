@@ -57,6 +57,26 @@ def untraced(function: str, *inputs: Any) -> None:
         raise ValueError(f"{function} must be called with values, got traced ones; call it outside jit, grad, vmap")
 
 
+def shape(name: str, came: tuple[int, ...], *expected: tuple[int, ...], meaning: str = "") -> None:
+    """The shape that came is one of those expected."""
+    if came not in expected:
+        what = f"{' or '.join(map(str, expected))}{meaning and ', ' + meaning}"
+        raise ValueError(f"{name} must have shape {what}, got {came}")
+
+
+def increasing(name: str, times: Any) -> None:
+    """Each of the times is later than the one before. Traced times are passed over."""
+    if is_traced(times):
+        return
+    wrong = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))
+    if wrong.size:
+        k = wrong[0]
+        raise ValueError(
+            f"{name} must increase, got {times[k]:g} then {times[k + 1]:g} at {k + 1}; "
+            f"sort them and drop what is repeated"
+        )
+
+
 def not_negative(name: str, x: Any, unit: str) -> None:
     """No number in the array x is below zero. A traced x is passed over, as is NaN, which `diagnose` finds."""
     if is_traced(x):

@@ -87,9 +87,7 @@ class Collisions:
             if max(i, j) >= particles:
                 raise ValueError(f"Collisions.pairs must be indices below {particles}, got ({i}, {j})")
         for name, shapes in (("radius", ((), (particles,))), ("restitution", ((),)), ("friction", ((),))):
-            shape = getattr(self, name).shape
-            if shape not in shapes:
-                raise ValueError(f"Collisions.{name} must have shape {' or '.join(map(str, shapes))}, got {shape}")
+            _check.shape(f"Collisions.{name}", getattr(self, name).shape, *shapes)
         for collider in self.colliders:
             check_collider(collider, dim)
 

@@ -10,7 +10,8 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._root import root
-from jeuler.colliders import Collider, length, normal_and_speed, unit
+from jeuler._vectors import length, unit
+from jeuler.colliders import Collider, normal_and_speed
 
 MAX_STRIDES = 100  # along one path; a path that grazes a surface needs many
 NEWTON_STEPS = 5

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
-from jeuler.forces.springs import direction
+from jeuler import _check, _tree
+from jeuler._vectors import direction
 from jeuler.forces.topology import Indices, Topology, check_indices
 
 
@@ -53,11 +53,8 @@ class Viscosity:
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
-        if self.coefficient.shape not in ((), (len(self.edges),)):
-            raise ValueError(
-                f"Viscosity.coefficient must have shape () or ({len(self.edges)},), one a pair, "
-                f"got {self.coefficient.shape}"
-            )
+        shape = self.coefficient.shape
+        _check.shape("Viscosity.coefficient", shape, (), (len(self.edges),), meaning="one a pair")
 
 
 def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
@@ -135,10 +132,7 @@ class Bending:
         check_indices("Bending.triples", self.triples, particles)
         for name in ("stiffness", "rest_angle"):
             shape = getattr(self, name).shape
-            if shape not in ((), (len(self.triples),)):
-                raise ValueError(
-                    f"Bending.{name} must have shape () or ({len(self.triples)},), one a triple, got {shape}"
-                )
+            _check.shape(f"Bending.{name}", shape, (), (len(self.triples),), meaning="one a triple")
 
 
 def reciprocal(length: Array) -> Array:

@@ -11,21 +11,10 @@ from jax import Array
 
 from jeuler import _check, _tree
 from jeuler._components import split, stack
+from jeuler._vectors import direction
 from jeuler.forces.incidence import stored
 from jeuler.forces.layouts import Layout
 from jeuler.forces.topology import Topology
-
-
-def direction(d: Array) -> tuple[Array, Array]:
-    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r = 0.
-
-    Ends closer than tiny^(1/3) (2e-13 in float32, 3e-103 in float64) count as coincident: below that, the
-    second derivative of r overflows.
-    """
-    square = jnp.sum(d * d, axis=-1, keepdims=True)
-    apart = square > jnp.finfo(d.dtype).tiny ** (2 / 3)
-    r = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
-    return r, jnp.where(apart, d / jnp.where(apart, r, 1), 0)
 
 
 @jax.custom_jvp
@@ -126,13 +115,9 @@ class Springs:
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
-        for name in ("ks", "kd", "rest_length"):
-            shape = getattr(self, name).shape
-            if shape not in ((), (len(self.edges),)):
-                raise ValueError(
-                    f"Springs.{name} must have shape () or ({len(self.edges)},), one a spring, got {shape}"
-                )
         for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("rest_length", "m")):
+            shape = getattr(self, name).shape
+            _check.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
             _check.not_negative(f"Springs.{name}", getattr(self, name), unit)
 
 

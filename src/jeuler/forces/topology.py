@@ -29,7 +29,7 @@ class Indices:
         return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and self._key == other._key  # type: ignore[attr-defined]
+        return type(other) is type(self) and self._key == other._key
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.indices, dtype=dtype)
