@@ -37,9 +37,8 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
             return tuple(getattr(x, n) for n in children), tuple(getattr(x, n) for n in static)
 
         def flatten_with_keys(x: T):
-            return tuple((k, getattr(x, n)) for k, n in zip(keys, children, strict=True)), tuple(
-                getattr(x, n) for n in static
-            )
+            values, aux = flatten(x)
+            return tuple(zip(keys, values, strict=True)), aux
 
         def unflatten(aux: Any, values: Any) -> T:
             x = object.__new__(cls)
@@ -146,7 +145,8 @@ def all_finite(y: PyTree) -> Array:
 
 def largest(y: PyTree) -> Array:
     """The largest absolute value in y; 0 where there is none."""
-    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(leaf), initial=0) for leaf in jax.tree.leaves(y)], 0)
+    nothing: Any = 0
+    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(leaf), initial=0) for leaf in jax.tree.leaves(y)], nothing)
 
 
 def parts(y: PyTree) -> tuple[list[PyTree], Any]:

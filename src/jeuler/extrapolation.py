@@ -45,9 +45,8 @@ class ExtrapolatedStep:
         if self.order == 1:
             best = jax.tree.map(lambda row: row[0], rows)
             return best, jax.tree.map(jnp.zeros_like, best)
-        columns = jax.tree.map(aitken_neville, rows)
-        pick = lambda which: jax.tree.map(lambda _, pair: pair[which], y, columns)  # noqa: E731
-        best, before = pick(0), pick(1)
+        pairs = jax.tree.map(aitken_neville, rows)
+        best, before = jax.tree.transpose(jax.tree.structure(y), jax.tree.structure((0, 0)), pairs)
         return best, _tree.subtract(best, before)
 
     def rows(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:

@@ -215,7 +215,8 @@ def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTr
         return counter(lambda dt: FixedRun(plan[0].method, plan[0].t0, dt, num_steps))
 
     four, eight = fixed(4), fixed(8)
-    adaptive = counter(lambda tolerance: dataclasses.replace(run, tolerance=tolerance))
+    adaptive_runs = [run for run in plan if isinstance(run, AdaptiveRun)]
+    adaptive = counter(lambda tolerance: dataclasses.replace(adaptive_runs[0], tolerance=tolerance))
     laws = []
     for run in plan:
         if isinstance(run, AdaptiveRun):

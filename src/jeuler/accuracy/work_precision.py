@@ -101,6 +101,8 @@ def work_precision(
     _check.untraced("work_precision", y0, args, t0, t1)
     t0, t1 = _check.interval(t0, t1)
     dts = _positive_values("dts", dts, "s")
+    if not dts:
+        raise ValueError("dts must name at least one step size, got none")
     tolerances = _positive_values("tolerances", tolerances)
     repeats = _check.count("repeats", repeats, least=1)
     _check.positive("timeout", timeout, "s")
@@ -218,6 +220,4 @@ def _positive_values(name: str, values: Any, unit: str = "") -> list[float]:
     values = np.atleast_1d(np.asarray(values, dtype=float)).ravel().tolist() if np.ndim(values) < 2 else [math.nan]
     for value in values:
         _check.positive(f"each of {name}", value, unit)
-    if name == "dts" and not values:
-        raise ValueError("dts must name at least one step size, got none")
     return values
