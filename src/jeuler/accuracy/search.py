@@ -23,8 +23,8 @@ FACTOR = 3.0  # an error within this factor of the target is near it
 MARGIN = 0.01  # by which dt may be larger with the error still near the target
 FINENESS = 1e-3  # part of the number of steps below which the search makes no difference
 TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
-ROUGH = 2**18  # steps of the longest run in float32
 REGULAR = 0.25  # and the observed order be this close to the step's own, to predict beyond the pilots
+ROUGH = 2**18  # steps of the longest run in float32
 
 
 class Search:
