@@ -15,6 +15,7 @@ from cases import (
     METHODS,
     NET_EDGES,
     force_state,
+    leapfrog_step,
     net_scene,
     net_state,
 )
@@ -266,13 +267,6 @@ def test_compensated_run_agrees_with_the_plain_one():
 
 def test_a_step_of_ones_own_gets_arrays():
     """A leapfrog written on arrays (particle, dim) keeps the energy of an undamped net to second order."""
-
-    def leapfrog_step(f, t, y, dt, args):
-        x, v = y
-        half = v + dt / 2 * f(t, (x, v), args)[1]
-        x = x + dt * half
-        return x, half + dt / 2 * f(t + dt, (x, half), args)[1]
-
     scene = jeuler.Scene(forces=(dataclasses.replace(FORCES["springs"](), kd=0.0),))
     drifts = []
     for num_steps in (200, 400):
