@@ -60,21 +60,21 @@ def is_adaptive(method: Any) -> bool:
 def named(steps: Any) -> dict[str, Any]:
     """``steps`` as a dictionary: a mapping as it is, a sequence by the names of its functions."""
     if isinstance(steps, Mapping):
-        named = dict(steps)
+        methods = dict(steps)
     else:
         steps = [steps] if callable(steps) or is_diffrax(steps) else list(steps)
-        named = {getattr(s, "__name__", type(s).__name__).removesuffix("_step"): s for s in steps}
-        if len(named) < len(steps):
+        methods = {getattr(s, "__name__", type(s).__name__).removesuffix("_step"): s for s in steps}
+        if len(methods) < len(steps):
             raise ValueError("steps given as a list must have different names; pass a dict {name: step}")
-    for name, method in named.items():
+    for name, method in methods.items():
         inner = method.step if isinstance(method, Compensated) else method
         if not (callable(inner) or is_diffrax(inner)):
             raise ValueError(
                 f"steps[{name!r}] must be a step (f, t, y, dt, args) -> y or a diffrax solver, got {method!r}"
             )
-    if not named:
+    if not methods:
         raise ValueError("steps must name at least one method, got none")
-    return named
+    return methods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,17 +104,8 @@ class FixedRun:
             import diffrax
 
             times = jnp.asarray(self.times, _tree.time_dtype(y0))
-            return _diffrax(
-                f,
-                y0,
-                args,
-                self.method,
-                times,
-                self.dt,
-                diffrax.ConstantStepSize(),
-                self.num_steps + 8,
-                adjoint,
-            )
+            equal, most = diffrax.ConstantStepSize(), self.num_steps + 8
+            return _diffrax(f, y0, args, self.method, times, self.dt, equal, most, adjoint)
         compensated = isinstance(self.method, Compensated)
         run = solve(
             f,
