@@ -1,9 +1,7 @@
-"""Each peer as ``peer(work) -> (forward, gradient)``: two functions without arguments, or None where it has
-none.
+"""Each peer as ``peer(work) -> (forward, gradient)``: two functions without arguments, or None where it has none.
 
-``forward()`` gives the positions at the end, (batch, particle, 3); ``gradient()`` the derivative of the sum
-of their squares with respect to initial position, velocity, ks and kd, in this order. All do explicit Euler
-in float32.
+``forward()`` gives the positions at the end, (batch, particle, 3); ``gradient()`` the derivative of the sum of their
+squares with respect to initial position, velocity, ks and kd, in this order. All do explicit Euler in float32.
 """
 
 from __future__ import annotations
@@ -28,8 +26,7 @@ Pair = tuple[Callable | None, Callable | None]
 
 
 def _compiled(final: Callable, work: Work) -> Pair:
-    """Forward and gradient of ``final(position, velocity, ks, kd) -> position`` of one system, vmapped over a
-    batch."""
+    """Forward and gradient of ``final(position, velocity, ks, kd) -> position`` of one system, vmapped over a batch."""
     if work.batch > 1:
         run = jax.vmap(final, in_axes=(0, 0, None, None))
         start = work.position, work.velocity
@@ -37,9 +34,7 @@ def _compiled(final: Callable, work: Work) -> Pair:
         run, start = final, (work.position[0], work.velocity[0])
     args = (*map(jnp.asarray, start), jnp.float32(KS), jnp.float32(KD))
     forward = jax.jit(run).lower(*args).compile()
-    gradient = (
-        jax.jit(jax.grad(lambda *a: jnp.sum(run(*a) ** 2), argnums=(0, 1, 2, 3))).lower(*args).compile()
-    )
+    gradient = jax.jit(jax.grad(lambda *a: jnp.sum(run(*a) ** 2), argnums=(0, 1, 2, 3))).lower(*args).compile()
     return lambda: jax.block_until_ready(forward(*args)), lambda: jax.block_until_ready(gradient(*args))
 
 

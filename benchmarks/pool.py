@@ -14,6 +14,7 @@ import statistics
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jeuler import Gravity, ParticleState, Scene, simulate, symplectic_euler_step, uses
@@ -50,9 +51,9 @@ def pool(capacity: int, births: bool = True):
     random = np.random.default_rng(0)
     alive, life = np.arange(capacity) < ALIVE, 1.0 if births else 1e9
     state = empty_pool(capacity, 3).replace(
-        alive=jax.numpy.asarray(alive),
-        age=jax.numpy.asarray(np.where(alive, random.uniform(0, 1, capacity), 0.0), "float32"),
-        lifetime=jax.numpy.asarray(np.where(alive, life, 0.0), "float32"),
+        alive=jnp.asarray(alive),
+        age=jnp.asarray(np.where(alive, random.uniform(0, 1, capacity), 0.0), "float32"),
+        lifetime=jnp.asarray(np.where(alive, life, 0.0), "float32"),
     )
     return Scene(FORCES, (*([DROPS] if births else []), Lifetime(), OverLife("opacity", [1.0, 0.0]))), state
 
@@ -62,7 +63,7 @@ def program(scene, state, *, save_every=25, windows=()):
 
     def end(scene, state, key):
         def counts(t, state):
-            zero = jax.numpy.int32(0)
+            zero = jnp.int32(0)
             births = zero if state.births is None else state.births
             missed = zero if state.missed_births is None else state.missed_births
             alive = zero + len(state.position) if state.alive is None else state.alive.sum()

@@ -26,9 +26,8 @@ PARTICLES, FRAMES = 10_000, 200
 def swirl(dim: int) -> Solution:
     """Particles that circle, each at its own height, radius, pace, colour and size."""
     random = np.random.default_rng(0)
-    angle = random.uniform(0, 2 * np.pi, PARTICLES) + np.linspace(0, 3, FRAMES)[:, None] * random.uniform(
-        0.5, 2, PARTICLES
-    )
+    start, pace = random.uniform(0, 2 * np.pi, PARTICLES), random.uniform(0.5, 2, PARTICLES)
+    angle = start + pace * np.linspace(0, 3, FRAMES)[:, None]
     radius = random.uniform(0.2, 1, PARTICLES)
     position = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
     if dim == 3:

@@ -2,10 +2,10 @@
 
     python benchmarks/run.py [--all] [--rounds 7] [--out benchmarks/results]
 
-Times are medians over the rounds, in nanoseconds per spring (or free particle, or oscillator) and step; in a
-round each peer runs in turn, forward and gradient, so that what else the machine does hits all alike. The peers'
-results are compared before they are timed. Needs jax-md and warp-lang beside jeuler's own dependencies; a
-peer that is not installed is left out, and said so.
+Times are medians over the rounds, in nanoseconds per spring (or free particle, or oscillator) and step; in a round each
+peer runs in turn, forward and gradient, so that what else the machine does hits all alike. The peers' results are
+compared before they are timed. Needs jax-md and warp-lang beside jeuler's own dependencies; a peer that is not
+installed is left out, and said so.
 """
 
 from __future__ import annotations
@@ -63,9 +63,7 @@ def compare(work, runs) -> None:
     """All peers come to the same end: the moves agree to 1e-3 of the largest and one rounding of the positions a step
     (jax-md has no damper, and may not)."""
     start = work.position.reshape(-1, 3)
-    moves = {
-        n: np.asarray(run()).reshape(-1, 3) - start for (n, kind), run in runs.items() if kind == FORWARD
-    }
+    moves = {n: np.asarray(run()).reshape(-1, 3) - start for (n, kind), run in runs.items() if kind == FORWARD}
     largest, rounding = np.abs(moves["jeuler"]).max(), work.steps * np.spacing(np.abs(start).max())
     for name, move in moves.items():
         error = np.abs(move - moves["jeuler"]).max() / largest
@@ -97,9 +95,7 @@ def versions() -> str:
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         compiler = "not installed"
-    head = (
-        f"{cpu}, {os.cpu_count()} cores, {platform.system()}; Python {platform.python_version()}, float32, "
-    )
+    head = f"{cpu}, {os.cpu_count()} cores, {platform.system()}; Python {platform.python_version()}, float32, "
     return head + ", ".join(found) + f", gcc {compiler}"
 
 
@@ -110,9 +106,7 @@ def cell(value: float | None) -> str:
 def table(results: dict) -> str:
     """One row a peer, two columns a work: forward and gradient."""
     peers = list(dict.fromkeys(peer for times in results.values() for peer, _ in times))
-    lines = [
-        "| ns per spring and step | " + " | ".join(f"{work}: forward | gradient" for work in results) + " |"
-    ]
+    lines = ["| ns per spring and step | " + " | ".join(f"{work}: forward | gradient" for work in results) + " |"]
     lines.append("|---|" + "--:|--:|" * len(results))
     for peer in peers:
         cells = [cell(times.get((peer, kind))) for times in results.values() for kind in (FORWARD, GRADIENT)]
@@ -141,9 +135,7 @@ def figure(results: dict, path: pathlib.Path) -> None:
             for kind, shift, alpha in ((FORWARD, -0.2, 1.0), (GRADIENT, 0.2, 0.45)):
                 if (peer, kind) in times:
                     ax.barh(place + shift, times[peer, kind], height=0.38, color=color, alpha=alpha)
-        ax.set_yticks(
-            range(len(peers)), peers if index % columns == 0 or len(peers) < 5 else [""] * len(peers)
-        )
+        ax.set_yticks(range(len(peers)), peers if index % columns == 0 or len(peers) < 5 else [""] * len(peers))
         ax.invert_yaxis()
         ax.set_xscale("log")
         ax.set_xlim(left=min(times.values()) / 3)
@@ -154,9 +146,7 @@ def figure(results: dict, path: pathlib.Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--all", action="store_true", help="also the large systems, up to a million springs")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--no-memory", action="store_true", help="leave the table of memory out")

@@ -10,38 +10,30 @@ within a factor 3 with dt 1 % larger: all else balances on the edge of instabili
 """
 
 import collections
-import json
 import math
+import pathlib
 import sys
 import time
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jeuler
 from jeuler.accuracy.pilot import Pilot, distance
 
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "tests"))
+from published import problems_in
+
 LONGEST = 1e10  # numbers advanced in a run, steps times the size of the state
-
-NAMES = {name: getattr(jnp, name) for name in ("sin", "cos", "exp", "sqrt", "pi", "where", "floor", "sign")}
-NAMES |= {"range": range, "sum": sum, "abs": abs}
-
-
-def published(problem):
-    """The vector field and the initial state of one problem of the file."""
-    right_side = eval("lambda t, y: " + problem["rhs"], NAMES)
-    field = lambda t, y, args: jnp.stack([jnp.asarray(v, y.dtype) for v in right_side(t, y)])  # noqa: E731
-    return field, jnp.array(problem["y0"], float)
 
 
 class Runs:
     """Relative errors of runs of one problem, each made once."""
 
     def __init__(self, problem, moved=0.0):
-        field, y0 = published(problem)
-        self.run = Pilot(field, y0 * (1 + moved), problem["t0"], problem["t1"], None, jeuler.euler_step, float, False)
-        self.reference = np.array(problem["reference"])
+        y0 = problem.y0 * (1 + moved)
+        self.run = Pilot(problem.f, y0, problem.t0, problem.t1, None, jeuler.euler_step, float, False)
+        self.reference = problem.reference
         self.known = {}
 
     def __call__(self, num_steps):
@@ -70,21 +62,17 @@ def larger_steps(runs, moved, num_steps, target):
 
 def main(path, part=""):
     jax.config.update("jax_enable_x64", True)
-    with open(path) as file:
-        problems = [p for p in json.load(file)["problems"] if part in p["name"]]
+    problems = {name: problem for name, problem in problems_in(path).items() if part in name}
     ratios, kinds, seconds = [], collections.Counter(), []
-    for problem in problems:
-        field, y0 = published(problem)
+    for name, problem in problems.items():
         runs, moved = Runs(problem), Runs(problem, moved=1e-13)
         for target in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5):
             begin = time.process_time()
-            advice = jeuler.advise_step(field, y0, t0=problem["t0"], t1=problem["t1"], error=target)
+            advice = jeuler.advise_step(problem.f, problem.y0, t0=problem.t0, t1=problem.t1, error=target)
             seconds.append(time.process_time() - begin)
-            run_it = advice.feasible and advice.num_steps * y0.size <= LONGEST
+            run_it = advice.feasible and advice.num_steps * problem.y0.size <= LONGEST
             ratio = runs(advice.num_steps) / target if run_it else math.nan
-            print(
-                f"{problem['name']:22s} {target:.0e}  {ratio:8.2g}  {seconds[-1]:4.1f} s  {advice.reason}", flush=True
-            )
+            print(f"{name:22s} {target:.0e}  {ratio:8.2g}  {seconds[-1]:4.1f} s  {advice.reason}", flush=True)
             if not run_it:
                 kinds["unchecked" if advice.feasible else "refused"] += 1
                 continue

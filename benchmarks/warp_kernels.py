@@ -1,5 +1,4 @@
-"""The kernels of the Warp peer: springs add to their ends atomically, Warp differentiates them on its
-tape."""
+"""The kernels of the Warp peer: springs add to their ends atomically, Warp differentiates them on its tape."""
 
 import warp as wp
 

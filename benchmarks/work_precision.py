@@ -2,8 +2,8 @@
 
     python benchmarks/work_precision.py            # docs/work_precision.png, .md and .csv
 
-A hanging net of 6 x 6 particles, structural and shear springs with damping, its top corners pinned, swings
-for half a second. The reference is diffrax's Dopri8 at tolerance 1e-13 in float64.
+A hanging net of 6 x 6 particles, structural and shear springs with damping, its top corners pinned, swings for half a
+second. The reference is diffrax's Dopri8 at tolerance 1e-13 in float64.
 """
 
 import argparse
@@ -87,9 +87,7 @@ def sweep(dts, dtypes=("float32", "float64"), tolerances=(1e-4, 1e-6), timeout=1
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--folder", type=pathlib.Path, default=ROOT / "docs", help="where the figure and table go"
-    )
+    parser.add_argument("--folder", type=pathlib.Path, default=ROOT / "docs", help="where the figure and table go")
     folder = parser.parse_args().folder
     begun = time.perf_counter()
     table = sweep(dts=[0.5 / n for n in (100, 500, 2500, 12500)])

@@ -25,6 +25,14 @@ METHODS = {
 }
 
 
+def leapfrog_step(f, t, y, dt, args):
+    """A step of one's own: velocity Verlet on y = (position, velocity)."""
+    x, v = y
+    half = v + dt / 2 * f(t, (x, v), args)[1]
+    x = x + dt * half
+    return x, half + dt / 2 * f(t + dt, (x, half), args)[1]
+
+
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """y' = f(t, y, args) with an exact solution where there is one."""

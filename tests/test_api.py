@@ -24,6 +24,7 @@ def test_public_name_has_a_full_docstring(name):
     gives_back = "Attributes:" in doc  # a class of results, which nobody makes
     for section in ("Example:", ">>>") if gives_back else ("Args:", "Raises:", "Example:", ">>>", "Source:"):
         assert section in doc, section
+    assert "Returns:" in doc or not inspect.isfunction(getattr(jeuler, name))
 
 
 @pytest.mark.parametrize("name", jeuler.plotting.__all__)

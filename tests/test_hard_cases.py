@@ -1,5 +1,6 @@
 """Springs, masses, long runs and long horizons that break simulators: each must be finite and right."""
 
+import dataclasses
 import functools
 
 import jax
@@ -79,9 +80,7 @@ def test_very_stiff_next_to_very_soft():
 
     @jax.jit
     def end(ks):
-        from dataclasses import replace
-
-        softer = jeuler.Scene((scene.forces[0], replace(chain, ks=ks)))
+        softer = jeuler.Scene((scene.forces[0], dataclasses.replace(chain, ks=ks)))
         run = jeuler.simulate(softer, state, dt=0.1, num_steps=500, step=implicit_euler_step, save_every=500)
         return run.y.position[-1, :, 0]
 

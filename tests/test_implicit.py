@@ -1,13 +1,13 @@
 """Implicit steps: the values of exact solutions, derivatives in every mode, stiff problems, the stiff cloth."""
 
 import functools
-import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hard_scenes import cloth, cloth_scene
+from published import published
 
 import jeuler
 from jeuler.implicit import implicit_euler, implicit_euler_step, linearly_implicit_euler_step
@@ -189,21 +189,10 @@ STIFF = {  # steps; where explicit Euler overflows at the same number of steps
 
 @pytest.mark.parametrize("name", STIFF)
 def test_stiff_problems_run_to_the_end_with_first_order_error(name, shared):
-    problems = json.loads((shared / "reference" / "ode_problems.json").read_text())["problems"]
-    problem = next(p for p in problems if p["name"] == name)
-    right_side = eval("lambda t, y: " + problem["rhs"], {"range": range})
-    y0, t1 = jnp.array(problem["y0"]), problem["t1"]
-    reference = np.array(problem["reference"])
+    f, y0, _, t1, reference = published(shared, name)
 
     def end(step, num_steps):
-        return jeuler.solve(
-            lambda t, y, args: jnp.stack(right_side(t, y)),
-            y0,
-            dt=t1 / num_steps,
-            num_steps=num_steps,
-            save_every=num_steps,
-            step=step,
-        )
+        return jeuler.solve(f, y0, dt=t1 / num_steps, num_steps=num_steps, save_every=num_steps, step=step)
 
     steps, explicit_overflows = STIFF[name]
     errors = []

@@ -6,16 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import leapfrog_step, oscillator
 
 import jeuler
 from jeuler.extrapolation import extrapolated_euler
 from jeuler.implicit import implicit_euler_step, linearly_implicit_euler_step
 from jeuler.stability import DENSE, stability_limit
-
-
-def oscillator(t, y, args):
-    ks, kd = args
-    return y[1], -ks * y[0] - kd * y[1]
 
 
 def decay(t, y, rate):
@@ -108,8 +104,7 @@ PROBLEMS = [
 
 @pytest.mark.parametrize("number", range(len(PROBLEMS)))
 def test_runs_blow_up_within_five_percent_of_the_limit(number):
-    """A perturbation of 1e-8 of the rest state stays as small at 0.95 of the limit, and grows at 1.05 of
-    it."""
+    """A perturbation of 1e-8 of the rest state stays as small at 0.95 of the limit, and grows at 1.05 of it."""
     f, y, args, step = PROBLEMS[number]
     limit = stability_limit(f, 0.0, y, args, step=step)
     leaves, tree = jax.tree.flatten(y)
@@ -148,13 +143,7 @@ def test_a_system_that_only_drifts_is_stable_at_any_step():
 
 
 def test_a_step_of_ones_own_and_complex_states():
-    def leapfrog(f, t, y, dt, args):
-        x, v = y
-        v = v + dt / 2 * f(t, (x, v), args)[1]
-        x = x + dt * v
-        return x, v + dt / 2 * f(t + dt, (x, v), args)[1]
-
-    assert stability_limit(oscillator, 0.0, START, (KS, 0.0), step=leapfrog) == pytest.approx(0.4, rel=1e-3)
+    assert stability_limit(oscillator, 0.0, START, (KS, 0.0), step=leapfrog_step) == pytest.approx(0.4, rel=1e-3)
     spiral = lambda t, y, args: (-1 + 6j) * y  # noqa: E731
     assert stability_limit(spiral, 0.0, 1.0 + 0j) == pytest.approx(2 / 37, rel=1e-6)
 

@@ -57,10 +57,10 @@ def main(argv: list[str] | None = None) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jeuler import _measurement
+    from jeuler._fit_file import fit_file
 
     try:
-        _measurement.fit_file(arguments, STARTED if argv is None else time.perf_counter())
+        fit_file(arguments, STARTED if argv is None else time.perf_counter())
     except (ValueError, OSError) as error:
         print(f"jeuler fit: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

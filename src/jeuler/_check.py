@@ -42,6 +42,41 @@ def positive(name: str, x: Any, unit: str = "") -> None:
         raise ValueError(f"{name} must be greater than 0{unit and ' ' + unit}, got {x!r}")
 
 
+def interval(t0: Any, t1: Any) -> tuple[float, float]:
+    """t0 and t1 as floats, t1 the later one."""
+    for name, t in (("t0", t0), ("t1", t1)):
+        number(name, t)
+    if not float(t1) > float(t0):
+        raise ValueError(f"t1 must be later than t0={float(t0):g}, got {float(t1):g}")
+    return float(t0), float(t1)
+
+
+def untraced(function: str, *inputs: Any) -> None:
+    """No array in the inputs of this function is being traced."""
+    if any(map(is_traced, jax.tree.leaves(inputs))):
+        raise ValueError(f"{function} must be called with values, got traced ones; call it outside jit, grad, vmap")
+
+
+def shape(name: str, came: tuple[int, ...], *expected: tuple[int, ...], meaning: str = "") -> None:
+    """The shape that came is one of those expected."""
+    if came not in expected:
+        what = f"{' or '.join(map(str, expected))}{meaning and ', ' + meaning}"
+        raise ValueError(f"{name} must have shape {what}, got {came}")
+
+
+def increasing(name: str, times: Any) -> None:
+    """Each of the times is later than the one before. Traced times are passed over."""
+    if is_traced(times):
+        return
+    wrong = np.flatnonzero(~(np.diff(np.asarray(times)) > 0))
+    if wrong.size:
+        k = wrong[0]
+        raise ValueError(
+            f"{name} must increase, got {times[k]:g} then {times[k + 1]:g} at {k + 1}; "
+            f"sort them and drop what is repeated"
+        )
+
+
 def not_negative(name: str, x: Any, unit: str) -> None:
     """No number in the array x is below zero. A traced x is passed over, as is NaN, which `diagnose` finds."""
     if is_traced(x):

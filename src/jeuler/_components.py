@@ -1,9 +1,9 @@
 """Arrays (particle, dim) as one array a component, the layout of the hot loop.
 
-A loop over (particle, 3) does not vectorise and its gathers go row by row; a loop over three arrays
-(particle,) does. So what runs at each step is written component by component. `split` and `stack` undo each
-other: where one follows the other the compiler drops both, forward and backward (each is the other's
-transpose), and what is written for (particle, dim), a user's own force for example, still fits in.
+A loop over (particle, 3) does not vectorise and its gathers go row by row; a loop over three arrays (particle,) does.
+So what runs at each step is written component by component. `split` and `stack` undo each other: where one follows the
+other the compiler drops both, forward and backward (each is the other's transpose), and what is written for arrays
+(particle, dim), a user's own force for example, still fits in.
 """
 
 from __future__ import annotations

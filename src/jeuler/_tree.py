@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 
 PyTree = Any
@@ -35,9 +37,8 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
             return tuple(getattr(x, n) for n in children), tuple(getattr(x, n) for n in static)
 
         def flatten_with_keys(x: T):
-            return tuple((k, getattr(x, n)) for k, n in zip(keys, children, strict=True)), tuple(
-                getattr(x, n) for n in static
-            )
+            values, aux = flatten(x)
+            return tuple(zip(keys, values, strict=True)), aux
 
         def unflatten(aux: Any, values: Any) -> T:
             x = object.__new__(cls)
@@ -103,6 +104,11 @@ def add(x: PyTree, y: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: a + b, x, y)
 
 
+def subtract(x: PyTree, y: PyTree) -> PyTree:
+    """x - y, leaf by leaf."""
+    return jax.tree.map(lambda a, b: a - b, x, y)
+
+
 def scale(a: ArrayLike, x: PyTree) -> PyTree:
     """a x, leaf by leaf, for a real scalar a taken to each leaf's precision."""
 
@@ -124,9 +130,40 @@ def combine(weights: tuple[float, ...], trees: list[PyTree]) -> PyTree:
     return total
 
 
+def in_dtypes_of(y: PyTree, x: PyTree) -> PyTree:
+    """x with each leaf in the dtype of that of y."""
+    return jax.tree.map(lambda a, b: jnp.asarray(a).astype(b.dtype), x, y)
+
+
 def all_finite(y: PyTree) -> Array:
     """Whether every number in y is finite, a boolean scalar."""
     finite = jnp.asarray(True)
     for leaf in jax.tree.leaves(y):
         finite &= jnp.all(jnp.isfinite(leaf))
     return finite
+
+
+def largest(y: PyTree) -> Array:
+    """The largest absolute value in y; 0 where there is none."""
+    nothing: Any = 0
+    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(leaf), initial=0) for leaf in jax.tree.leaves(y)], nothing)
+
+
+def parts(y: PyTree) -> tuple[list[PyTree], Any]:
+    """The outermost parts of a pytree, and the structure that puts such parts together."""
+    return jax.tree.flatten(y, is_leaf=lambda part: part is not y)
+
+
+def real_vector(y: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
+    """y as one real vector, and the way back; a complex leaf is its real and its imaginary part."""
+    leaves, structure = jax.tree.flatten(y)
+    is_complex = [jnp.iscomplexobj(leaf) for leaf in leaves]
+    parts = [(leaf.real, leaf.imag) if c else leaf for leaf, c in zip(leaves, is_complex, strict=True)]
+    vector, unravel = ravel_pytree(parts)
+
+    def back(vector: Array) -> PyTree:
+        parts = unravel(vector)
+        whole = [jax.lax.complex(*part) if c else part for part, c in zip(parts, is_complex, strict=True)]
+        return jax.tree.unflatten(structure, whole)
+
+    return vector, back

@@ -26,8 +26,8 @@ class AdaptiveSolution:
       y: the states at these times: a pytree with leading axis saved.
       num_steps: accepted steps, int32 scalar.
       num_rejected: steps tried again with a smaller dt, int32 scalar.
-      error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of
-        its own error, before the equation damps or amplifies it.
+      error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of its own
+        error, before the equation damps or amplifies it.
       finished: whether the last time was reached within max_steps; if not, the states from there on are NaN.
     Example:
       >>> import jeuler
@@ -59,12 +59,11 @@ def solve_adaptive(
 ) -> AdaptiveSolution:
     """Advance y' = f(t, y, args) to given times, each step sized so that its estimated error is within tolerance.
 
-        accept if rms(error / (atol + rtol max(|y|, |y_next|))) <= 1;   dt <- dt min(5, max(0.2, 0.9
-        rms^(-1/k)))
+        e = rms(error / (atol + rtol max(|y|, |y_next|)));   accept if e <= 1
+        dt <- dt min(5, max(0.2, 0.9 e^(-1/k))),   k the order of the step
 
-    A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad
-    work (each block is computed again on the way back). The derivative is that of the steps taken; their
-    sizes count as given.
+    A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
+    block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -85,8 +84,7 @@ def solve_adaptive(
       >>> [round(float(y), 5) for y in run.y], bool(run.finished)
       ([1.0, 0.36788, 0.13534], True)
 
-    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and
-      II.9.
+    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and II.9.
     """
     step = extrapolated_euler(6) if step is None else step
     if not hasattr(step, "increment_with_error") or step.order < 2:
@@ -100,11 +98,7 @@ def solve_adaptive(
             raise ValueError(f"{name} must be at least 0, got {tolerance!r}")
     times = jnp.atleast_1d(jnp.asarray(t1, _tree.time_dtype(y0)))
     t0 = jnp.asarray(t0, times.dtype)
-    if (
-        not _check.is_traced(times)
-        and not _check.is_traced(t0)
-        and not np.all(np.diff(times, prepend=t0) > 0)
-    ):
+    if not _check.is_traced(times) and not _check.is_traced(t0) and not np.all(np.diff(times, prepend=t0) > 0):
         raise ValueError(f"t1 must be later than t0={float(t0)} and increase, got {times.tolist()}")
     _check.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if dt0 is None:

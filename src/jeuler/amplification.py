@@ -33,9 +33,7 @@ def pair_amplification(step: Step, stiffness: jax.Array, damping: jax.Array) -> 
     (a, c), (b, d) = (step(field, 0.0, start, 1.0, None) for start in _unit_pairs())
     mean, determinant = (a + d) / 2, a * d - b * c
     square = mean**2 - determinant
-    return jnp.where(
-        square > 0, jnp.abs(mean) + jnp.sqrt(jnp.maximum(square, 0)), jnp.sqrt(jnp.abs(determinant))
-    )
+    return jnp.where(square > 0, jnp.abs(mean) + jnp.sqrt(jnp.maximum(square, 0)), jnp.sqrt(jnp.abs(determinant)))
 
 
 @functools.partial(jax.jit, static_argnames="step")
@@ -78,9 +76,7 @@ def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> 
     return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
 
 
-def pair_limits(
-    step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf
-) -> np.ndarray:
+def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf) -> np.ndarray:
     """The largest stable dt of each mode x'' = -k x - c x'."""
     size = np.sqrt(np.abs(stiffness)) + np.abs(damping)
     gain = functools.partial(_pair_gain, step, stiffness / size**2, damping / size)
@@ -88,8 +84,7 @@ def pair_limits(
 
 
 def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
-    """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if
-    endless.
+    """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if endless.
 
     gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|,
       (mode,).

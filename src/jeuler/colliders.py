@@ -14,21 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler import _tree
+from jeuler._vectors import length, unit
 
 Collider = Callable[[Any, Array], Array]
-
-
-def length(x: Array) -> Array:
-    """|x| along the last axis; it and its derivatives are 0 at x = 0."""
-    square = jnp.sum(x * x, axis=-1)
-    apart = square > jnp.finfo(x.dtype).tiny ** (2 / 3)
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
-
-
-def unit(x: Array) -> Array:
-    """x / |x| along the last axis; 0 at x = 0."""
-    r = length(x)[..., None]
-    return jnp.where(r > 0, x / jnp.where(r > 0, r, 1), 0)
 
 
 def normal_and_speed(collider: Collider, t: Any, point: Array) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ def uses(
       writes: fields that an effect changes for some particles; the state gets them if it has none.
       sets: fields that an effect gives to every particle, each step: nothing else may write them.
       before_motion: True for births and deaths, which come before the motion of a step.
-    Returns: a decorator that leaves the function as it is.
+    Returns: a decorator that gives the function back, with these as its attributes.
     Raises: ValueError, in `simulate`, if nothing provides a field that is read, or two effects write one in conflict.
     Example:
       >>> import jeuler

@@ -39,18 +39,15 @@ class ExtrapolatedStep:
         """y(t + dt) - y, what ``solve(compensated=True)`` adds."""
         return self.increment_with_error(f, t, y, dt, args)[0]
 
-    def increment_with_error(
-        self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any
-    ) -> tuple[PyTree, PyTree]:
+    def increment_with_error(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
         """The increment, and the estimated error of the one of order k - 1, T_kk - T_{k,k-1}."""
         rows = self.rows(f, t, y, dt, args)
         if self.order == 1:
             best = jax.tree.map(lambda row: row[0], rows)
             return best, jax.tree.map(jnp.zeros_like, best)
-        columns = jax.tree.map(aitken_neville, rows)
-        pick = lambda which: jax.tree.map(lambda _, pair: pair[which], y, columns)  # noqa: E731
-        best, before = pick(0), pick(1)
-        return best, jax.tree.map(lambda a, b: a - b, best, before)
+        pairs = jax.tree.map(aitken_neville, rows)
+        best, before = jax.tree.transpose(jax.tree.structure(y), jax.tree.structure((0, 0)), pairs)
+        return best, _tree.subtract(best, before)
 
     def rows(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
         """Increments over dt of the base step in 1, 2, ..., k substeps, with leading axis row.
@@ -77,7 +74,7 @@ class ExtrapolatedStep:
         return jax.tree.map(lambda h: h[lanes.end, lanes.lane], history)
 
     def _difference(self, f, t, y, dt, args):
-        return jax.tree.map(lambda a, b: a - b, self.base(f, t, y, dt, args), y)
+        return _tree.subtract(self.base(f, t, y, dt, args), y)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,17 +124,15 @@ def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> Extrapolat
         T_{j,1}: j substeps of dt / j;   y = T_kk
         T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (j / (j - m) - 1)
 
-    The k rows are one vmapped batch, k substeps deep, about k^2 / 2 evaluations of f in all. Of `euler_step`
-    it is an explicit Runge-Kutta method of order k; of a linearly implicit Euler step it stays stable on
-    stiff problems.
+    The k rows are one vmapped batch, k substeps deep, about k^2 / 2 evaluations of f in all. Of `euler_step` it is an
+    explicit Runge-Kutta method of order k; of a linearly implicit Euler step it stays stable on stiff problems.
 
     Args:
       order: k, the number of rows and the order, 1 to 12.
       step: a step of order 1 without memory: `euler_step`, an implicit or linearly implicit Euler step.
     Returns: a step for `solve`, ``(f, t, y, dt, args) -> y``, also with compensated sums; its
       ``increment_with_error`` gives the error estimate T_kk - T_{k,k-1} as well, which `solve_adaptive` uses.
-    Raises: ValueError if order is not an integer from 1 to 12, or step is known to be of another order than
-      1.
+    Raises: ValueError if order is not an integer from 1 to 12, or step is known to be of another order than 1.
     Example:
       >>> import jeuler
       >>> step = jeuler.extrapolated_euler(6)
@@ -145,9 +140,8 @@ def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> Extrapolat
       >>> abs(float(run.y[-1]) - 2.718281828) < 2e-6
       True
 
-    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.9; of
-      the linearly implicit step: P. Deuflhard, Recent progress in extrapolation methods, SIAM Review 27,
-      1985.
+    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.9; of the
+      linearly implicit step: P. Deuflhard, Recent progress in extrapolation methods, SIAM Review 27, 1985.
     """
     order = _check.count("order", order, least=1)
     if order > 12:

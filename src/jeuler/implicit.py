@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend.core import Literal
-from jax.flatten_util import ravel_pytree
 
 from jeuler import _check, _tree
 from jeuler._newton import StepInfo, linear_solver_for, newton_then_damped, solve_linear
@@ -161,7 +160,7 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
         slope, push = jax.linearize(lambda y: f(t + dt, y, args), y)
 
         def tangent_field(t, z, args):
-            return _tree.add(slope, push(jax.tree.map(jnp.subtract, z, y)))
+            return _tree.add(slope, push(_tree.subtract(z, y)))
 
         system = _system(tangent_field, t, y, dt, args, velocity_decides=_velocity_decides(f, t, y, args))
         if not system.start.size:
@@ -194,14 +193,13 @@ def _system(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, velocity_deci
     y = _check.state("y", y)
 
     def advance(z):
-        slope = jax.tree.map(lambda s, y: jnp.asarray(s).astype(y.dtype), f(t + dt, z, args), y)
-        return _tree.add(y, _tree.scale(dt, slope))
+        return _tree.add(y, _tree.scale(dt, _tree.in_dtypes_of(y, f(t + dt, z, args))))
 
     unknown = state = lambda z: z
-    roundoff = _largest(y)
+    roundoff = _tree.largest(y)
     if _velocity_decides(f, t, y, args) if velocity_decides is None else velocity_decides:
-        (position, _), pair = _parts(y)
-        roundoff = jnp.maximum(_largest(y), _largest(position) / dt)
+        (position, _), pair = _tree.parts(y)
+        roundoff = jnp.maximum(_tree.largest(y), _tree.largest(position) / dt)
 
         def unknown(z):
             return pair.flatten_up_to(z)[1]
@@ -210,24 +208,19 @@ def _system(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, velocity_deci
             new_position, _ = pair.flatten_up_to(advance(pair.unflatten((position, u))))
             return pair.unflatten((new_position, u))
 
-    start, from_vector = _real_vector(unknown(y))
+    start, from_vector = _tree.real_vector(unknown(y))
 
     def residual(vector):
-        return vector - _real_vector(unknown(advance(state(from_vector(vector)))))[0]
+        return vector - _tree.real_vector(unknown(advance(state(from_vector(vector)))))[0]
 
     eps = jnp.finfo(start.dtype).eps
     floor = jnp.full_like(start, lax.stop_gradient(10 * eps * roundoff))
     return System(start, residual, lambda vector: state(from_vector(vector)), floor)
 
 
-def _parts(y: PyTree) -> tuple[list[PyTree], Any]:
-    """The outermost parts of a pytree, and how to put them together."""
-    return jax.tree.flatten(y, is_leaf=lambda part: part is not y)
-
-
 def _velocity_decides(f: VectorField, t: Any, y: PyTree, args: Any) -> bool:
     """Whether y is a pair (position, velocity) and the traced slope of position makes no use of position."""
-    parts, pair = _parts(y)
+    parts, pair = _tree.parts(y)
     if len(parts) != 2:
         return False
     jaxpr = jax.make_jaxpr(lambda position: f(t, pair.unflatten((position, parts[1])), args))(parts[0]).jaxpr
@@ -240,23 +233,3 @@ def _velocity_decides(f: VectorField, t: Any, y: PyTree, args: Any) -> bool:
         if touches(equation.invars):
             touched.update(equation.outvars)
     return not touches(jaxpr.outvars[: len(jax.tree.leaves(parts[0]))])
-
-
-def _real_vector(y: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
-    """y as one real vector, and the way back; a complex leaf is its real and its imaginary part."""
-    leaves, structure = jax.tree.flatten(y)
-    tree: Any = structure
-    is_complex = [jnp.iscomplexobj(leaf) for leaf in leaves]
-    parts = [(leaf.real, leaf.imag) if c else leaf for leaf, c in zip(leaves, is_complex, strict=True)]
-    vector, unravel = ravel_pytree(parts)
-
-    def back(vector):
-        parts = unravel(vector)
-        return tree.unflatten([lax.complex(*p) if c else p for p, c in zip(parts, is_complex, strict=True)])
-
-    return vector, back
-
-
-def _largest(y: PyTree) -> Array:
-    """The largest absolute value in y; 0 where there is none."""
-    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0) for leaf in jax.tree.leaves(y)]))

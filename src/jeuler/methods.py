@@ -102,7 +102,7 @@ def symplectic_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any)
 
 def pair(y: PyTree) -> tuple[tuple[PyTree, ...], Callable[[Any], PyTree]]:
     """The two parts of a state (position, velocity), and the function that joins two such parts again."""
-    parts, structure = jax.tree.flatten(y, is_leaf=lambda part: part is not y)
+    parts, structure = _tree.parts(y)
     if len(parts) != 2:
         raise ValueError(
             f"y must be the pair (position, velocity) for symplectic_euler_step, got {structure}; "
@@ -145,9 +145,7 @@ RK4 = Tableau(
 )
 
 
-def runge_kutta_increment(
-    tableau: Tableau, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any
-) -> PyTree:
+def runge_kutta_increment(tableau: Tableau, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
     """dt sum_i b_i k_i with k_i = f(t + c_i dt, y + dt sum_j a_ij k_j, args)."""
     slopes: list[PyTree] = []
     for node, row in zip(tableau.nodes, tableau.matrix, strict=True):
@@ -238,10 +236,9 @@ def cap_cotangent(step: Step, max_norm: float) -> Step:
 
     def backward(_: None, cotangent: PyTree) -> tuple[PyTree]:
         # scaled by the largest entry first, so that the square does not overflow
-        leaves = jax.tree.leaves(cotangent)
-        largest = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(c), initial=0) for c in leaves])
+        largest = _tree.largest(cotangent)
         unit = jnp.where(largest > 0, largest, 1)
-        norm = unit * jnp.sqrt(sum(jnp.sum(jnp.abs(c / unit) ** 2) for c in leaves))
+        norm = unit * jnp.sqrt(sum(jnp.sum(jnp.abs(c / unit) ** 2) for c in jax.tree.leaves(cotangent)))
         return (_tree.scale(jnp.where(norm > max_norm, max_norm / norm, 1), cotangent),)
 
     cap.defvjp(forward, backward)

@@ -98,13 +98,13 @@ def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyT
         def one_step_back(carry, _):
             n, (x, v), (x_bar, v_bar), bars = carry
             n = n - 1
-            x = subtract(x, drift(v, parameters, quanta))
+            x = _tree.subtract(x, drift(v, parameters, quanta))
             a, pull_back = jax.vjp(lambda x, p: acceleration(n, x, v, p), x, parameters)
             v_bar = _tree.add(v_bar, _tree.scale(dt, x_bar))
             dt_bar = (_dot(x_bar, v) + _dot(v_bar, a)).astype(dt.dtype)
             by_x, by_parameters = pull_back(_tree.scale(dt, v_bar))
             bars = _tree.add(bars, [by_parameters[0] + dt_bar, *by_parameters[1:]])
-            v = subtract(v, kick(n, x, v, parameters, quanta))
+            v = _tree.subtract(v, kick(n, x, v, parameters, quanta))
             return (n, (x, v), (_tree.add(x_bar, by_x), v_bar), bars), None
 
         nothing = [jnp.zeros_like(p) for p in parameters]
@@ -141,10 +141,6 @@ def quantum(largest: Array) -> Array:
 def rounded(x: PyTree, quanta: PyTree) -> PyTree:
     """x to the nearest multiples of the quanta, leaf by leaf."""
     return jax.tree.map(lambda leaf, q: q * jnp.round(leaf / q), x, quanta)
-
-
-def subtract(x: PyTree, y: PyTree) -> PyTree:
-    return jax.tree.map(lambda a, b: a - b, x, y)
 
 
 def fingerprint(y: PyTree) -> Array:

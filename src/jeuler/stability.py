@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, Literal
 
@@ -18,9 +19,7 @@ from jeuler.methods import Step, VectorField, euler_step
 PyTree = Any
 
 DENSE = 512  # numbers in the state up to which all eigenvalues are computed
-NEUTRAL = (
-    4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
-)
+NEUTRAL = 4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
 UNDAMPED = 1e-10  # |real part| below this part of the largest eigenvalue is zero up to roundoff
 EXTREMES = 8  # eigenvalues asked for at each end of a large spectrum
 
@@ -38,20 +37,17 @@ def stability_limit(
 
         |R(dt lambda)| <= 1 for every eigenvalue lambda of df/dy (t, y)
 
-    R, the amplification of the step on y' = lambda y, is found by applying the step itself to that problem,
-    so any step has a limit: explicit, implicit, or one of your own. A step on pairs (position, velocity) that
-    treats the two differently, such as `symplectic_euler_step`, is applied to x'' = -k x - c x' instead, one
-    (k, c) a mode.
+    R, the amplification of the step on y' = lambda y, is found by applying the step itself to that problem, so any step
+    has a limit: explicit, implicit, or one of your own. A step on pairs (position, velocity) that treats the two
+    differently, such as `symplectic_euler_step`, is applied to x'' = -k x - c x' instead, one (k, c) a mode.
 
-    Explicit Euler: dt <= -2 Re(lambda) / |lambda|^2, so 2 z / omega for an oscillator of damping ratio z < 1,
-    and 0 without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no
-    limit, inf.
+    Explicit Euler: dt <= -2 Re(lambda) / |lambda|^2, so 2 z / omega for an oscillator of damping ratio z < 1, and 0
+    without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no limit, inf.
 
-    The limit belongs to the state: look at it where the system is stiffest. Eigenvalues that are 0
-    up to the roundoff of the data (a system that can drift) do not count. Up to 512 numbers in the state all
-    eigenvalues are computed; above, Arnoldi iteration on Jacobian-vector products finds those of the largest
-    modulus, real part and imaginary part, and the limit is that of these. Computed in float64 on the host, so
-    it is not for use under jit.
+    The limit belongs to the state: look at it where the system is stiffest. Eigenvalues that are 0 up to the roundoff
+    of the data (a system that can drift) do not count. Up to 512 numbers in the state all eigenvalues are computed;
+    above, Arnoldi iteration on Jacobian-vector products finds those of the largest modulus, real part and imaginary
+    part, and the limit is that of these. Computed in float64 on the host, so it is not for use under jit.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -62,8 +58,7 @@ def stability_limit(
       growing: "unstable": where the equation itself grows (Re lambda > 0) no dt is stable, 0.0; "skip": the
         growth is the solution's own and only the other eigenvalues count.
     Returns: the limit, s, a float; 0.0 when no dt is stable, inf when every dt is.
-    Raises: ValueError if y or t is traced, if f does not return the form of y, or if its Jacobian is not
-      finite.
+    Raises: ValueError if y or t is traced, if f does not return the form of y, or if its Jacobian is not finite.
     Example:
       >>> import jeuler
       >>> oscillator = lambda t, y, ks: (y[1], -ks * y[0])
@@ -80,10 +75,7 @@ def stability_limit(
     """
     if growing not in ("unstable", "skip"):
         raise ValueError(f'growing must be "unstable" or "skip", got {growing!r}')
-    if any(map(_check.is_traced, jax.tree.leaves((t, y, args)))):
-        raise ValueError(
-            "stability_limit must be called with values, got traced ones; call it outside jit, grad, vmap"
-        )
+    _check.untraced("stability_limit", t, y, args)
     _check.number("t", t)
     y = _check.state("y", y)
     _check.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
@@ -93,40 +85,28 @@ def stability_limit(
 
 
 class Linearisation:
-    """The linear field J u around states of one form: as products, as a matrix where it is small, by its
-    modes."""
+    """The linear field J u around states of one form: as products, as a matrix where it is small, by its modes."""
 
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
         self.neutral = NEUTRAL * float(np.sqrt(np.finfo(_tree.time_dtype(y)).eps))  # the data's own roundoff
         y, args = cast(y, np.float64), cast(args, np.float64)
-        structure: Any
-        leaves, structure = jax.tree.flatten(y)
-        split = [(leaf.real, leaf.imag) if jnp.iscomplexobj(leaf) else leaf for leaf in leaves]
-        self.complex = any(isinstance(part, tuple) for part in split)
-        self.flat, restore = ravel_pytree(split)  # complex numbers as pairs of real ones
-
-        def unflatten(flat):
-            parts = [jax.lax.complex(*part) if isinstance(part, tuple) else part for part in restore(flat)]
-            return jax.tree.unflatten(structure, parts)
+        self.complex = any(map(jnp.iscomplexobj, jax.tree.leaves(y)))
+        self.flat, self.unflatten = _tree.real_vector(y)
 
         def real_field(t, flat):
-            slopes = structure.flatten_up_to(f(t, unflatten(flat), args))
-            pairs = zip(slopes, split, strict=True)
-            parts = [(jnp.real(s), jnp.imag(s)) if isinstance(part, tuple) else s for s, part in pairs]
-            return ravel_pytree(parts)[0].astype(flat.dtype)
+            slope = f(t, self.unflatten(flat), args)
+            return _tree.real_vector(_tree.in_dtypes_of(y, slope))[0]
 
         def product(t, flat, u):
             return jax.jvp(lambda flat: real_field(t, flat), (flat,), (u,))[1]
 
-        self.unflatten = unflatten
         self.product = jax.jit(product)
         self.products = jax.jit(jax.vmap(product, in_axes=(None, None, 1), out_axes=1))
 
     def limits(
         self, t: Any, flat: Any, step: Step, *, growing: str = "skip", interval: float = math.inf
     ) -> tuple[float, float]:
-        """The largest stable dt at a state, and the largest at which no stable mode grows beyond e within an
-        interval."""
+        """The largest stable dt at a state, and the largest at which no stable mode grows e-fold within an interval."""
         rates, modes, matrix = self.eigen(t, flat)
         scale = np.abs(rates).max(initial=0.0)
         moving = np.abs(rates) > self.neutral * scale
@@ -140,26 +120,22 @@ class Linearisation:
         chosen = np.resize(np.flatnonzero(counts), rates.size)
         rates, modes = rates[chosen], modes[:, chosen]
         rates = np.where(np.abs(rates.real) <= UNDAMPED * scale, 1j * rates.imag, rates)
-        if treats_all_alike(step):  # type: ignore[arg-type]
-            limit = float(np.min(scalar_limits(step, rates)))
-            bound = limit if math.isinf(interval) else float(np.min(scalar_limits(step, rates, interval)))
-            return limit, max(limit, bound)
-        stiffness, damping = self.modal(t, flat, rates, modes)
-        limit = float(np.min(pair_limits(step, stiffness, damping)))
-        bound = (
-            limit if math.isinf(interval) else float(np.min(pair_limits(step, stiffness, damping, interval)))
-        )
-        return (limit if matrix is None else self.refined(step, matrix, limit)), max(limit, bound)
+        alike = treats_all_alike(step)  # type: ignore[arg-type]
+        if alike:
+            limits = functools.partial(scalar_limits, step, rates)
+        else:
+            limits = functools.partial(pair_limits, step, *self.modal(t, flat, rates, modes))
+        limit = float(np.min(limits()))
+        bound = limit if math.isinf(interval) else max(limit, float(np.min(limits(interval=interval))))
+        return (limit if alike or matrix is None else self.refined(step, matrix, limit)), bound
 
     def eigen(self, t: Any, flat: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is
-        small."""
+        """Eigenvalues, all or the extreme ones, their eigenvectors as columns, and the matrix if it is small."""
         n = self.flat.size
         matrix = np.asarray(self.products(t, flat, jnp.eye(n))) if n <= DENSE else None
         if not np.all(np.isfinite(self.product(t, flat, jnp.ones(n)) if matrix is None else matrix)):
             raise ValueError(
-                "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; "
-                "give a state at which f is smooth"
+                "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; give a state at which f is smooth"
             )
         if matrix is not None:
             rates, modes = np.linalg.eig(matrix)
@@ -173,9 +149,7 @@ class Linearisation:
         found = []
         for which in ("LM", "LR", "LI"):
             try:
-                found.append(
-                    eigs(operator, k=EXTREMES, which=which, v0=start, tol=1e-6, maxiter=20 * EXTREMES)
-                )
+                found.append(eigs(operator, k=EXTREMES, which=which, v0=start, tol=1e-6, maxiter=20 * EXTREMES))
             except ArpackNoConvergence as partial:
                 found.append((partial.eigenvalues, partial.eigenvectors))
         return np.concatenate([r for r, _ in found]), np.concatenate([v for _, v in found], axis=1), None
@@ -190,9 +164,7 @@ class Linearisation:
         still = np.zeros_like(shape)
 
         def quotient(direction):
-            real, imaginary = (
-                self.products(t, flat, jnp.asarray(part)) for part in (direction.real, direction.imag)
-            )
+            real, imaginary = (self.products(t, flat, jnp.asarray(part)) for part in (direction.real, direction.imag))
             image = np.asarray(real)[half:] + 1j * np.asarray(imaginary)[half:]
             return (-np.sum(shape.conj() * image, axis=0) / np.sum(np.abs(shape) ** 2, axis=0)).real
 

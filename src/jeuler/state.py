@@ -124,8 +124,7 @@ class ParticleState:
             raise ValueError(
                 f"state.velocity must have the dtype of position, {self.position.dtype}, got {self.velocity.dtype}"
             )
-        if self.mass.shape not in ((), shape[:1]):
-            raise ValueError(f"state.mass must have shape () or {shape[:1]}, one a particle, got {self.mass.shape}")
+        _check.shape("state.mass", self.mass.shape, (), shape[:1], meaning="one a particle")
         if not _check.is_traced(self.mass):
             mass = np.asarray(self.mass).ravel()
             bad = np.flatnonzero(~(mass > 0))

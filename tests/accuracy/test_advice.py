@@ -1,32 +1,19 @@
 """advise_step on published problems: achieved error against target; refusals with reasons."""
 
-import json
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from published import published
 
 import jeuler
 from jeuler.accuracy import advise_step
 from jeuler.accuracy.pilot import Pilot, distance
 
-NAMES = {name: getattr(jnp, name) for name in ("sin", "cos", "exp", "sqrt", "pi", "where", "floor", "sign")}
-NAMES |= {"range": range, "sum": sum, "abs": abs}
 FAST = [f"DETEST_nonstiff_{name}" for name in ("A1", "A3", "A4", "B1", "B3", "B5", "C1", "D1", "E2", "E5", "F1", "F5")]
 FAST += ["DETEST_stiff_B5", "DETEST_stiff_E2", "LORENZ_111_t10"]
-
-
-def published(shared, name):
-    with open(shared / "reference" / "ode_problems.json") as file:
-        (problem,) = [p for p in json.load(file)["problems"] if p["name"] == name]
-    right_side = eval("lambda t, y: " + problem["rhs"], NAMES)
-
-    def f(t, y, args):
-        return jnp.stack([jnp.asarray(part, y.dtype) for part in right_side(t, y)])
-
-    return f, jnp.array(problem["y0"], float), problem["t0"], problem["t1"], np.array(problem["reference"])
 
 
 @pytest.mark.parametrize("name", FAST)
@@ -200,3 +187,8 @@ def test_it_refuses_what_it_cannot_look_into(shared):
 def test_bad_input_is_told(change, message):
     with pytest.raises(ValueError, match=message):
         advise_step(lambda t, y, args: -y, 1.0, **({"t1": 1.0, "error": 1e-2} | change))
+
+
+def test_traced_values_are_told():
+    with pytest.raises(ValueError, match="advise_step must be called with values, got traced ones"):
+        jax.jit(lambda t1: advise_step(lambda t, y, args: -y, 1.0, t1=t1, error=1e-2))(1.0)

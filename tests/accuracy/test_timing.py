@@ -1,5 +1,4 @@
-"""The timing harness: a sleep of known length is measured, and what is done while compiling is kept out of
-it."""
+"""The timing harness: a sleep of known length is measured, and what is done while compiling is kept out of it."""
 
 import time
 

@@ -1,5 +1,4 @@
-"""Work-precision tables: errors against exact solutions, orders, floors, gradients, rows that failed, the
-figure."""
+"""Work-precision tables: errors against exact solutions, orders, floors, gradients, rows that failed, the figure."""
 
 import csv
 import math
@@ -247,6 +246,14 @@ def test_bad_input_is_told(change, message):
     }
     with pytest.raises(ValueError, match=message):
         work_precision(lambda t, y, args: -y, 1.0, **(given | change))
+
+
+def test_traced_values_are_told():
+    def of_start(y0):
+        return work_precision(lambda t, y, args: -y, y0, t1=1.0, dts=[0.1], steps={"euler": jeuler.euler_step})
+
+    with pytest.raises(ValueError, match="work_precision must be called with values, got traced ones"):
+        jax.jit(of_start)(1.0)
 
 
 def test_x64_is_left_as_it_was(table):

@@ -77,10 +77,10 @@ def advise_step(
     Finer targets than the pilots reach are predicted by the order of the step, where the errors have been seen
     to follow it. Pilots run in float64 whatever the precision of y0.
 
-    The roundoff floor is measured on runs in float32 beside those in float64. For a y0 in float32 it was
-    within a factor 3 of the floor that runs show in 36 of 37 cases (seven problems, three steps, plain and
-    compensated) and 5 in the last; for one in float64 it is carried over by the ratio of the two eps, and an
-    order of magnitude. Never more steps are counted on than the integer clock can count, 2^31 - 1.
+    The roundoff floor is measured on runs in float32 beside those in float64. For a y0 in float32 it was within a
+    factor 3 of the floor that runs show in 36 of 37 cases (seven problems, three steps, plain and compensated) and 5 in
+    the last; for one in float64 it is carried over by the ratio of the two eps, and an order of magnitude. Never more
+    steps are counted on than the integer clock can count, 2^31 - 1.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -90,11 +90,9 @@ def advise_step(
       t0: initial time, s.
       args: passed to f.
       step: the method.
-      relative: the target is relative to the norm of the state at t1 (True), or in the units of the state
-        (False).
+      relative: the target is relative to the norm of the state at t1 (True), or in the units of the state (False).
       compensated: advise for compensated sums.
-      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of
-        work.
+      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work.
     Returns: `StepAdvice`; it refuses, ``feasible=False`` with the reason, rather than guess.
     Raises: ValueError, naming the argument, what was expected and what came.
     Example:
@@ -103,17 +101,13 @@ def advise_step(
       >>> advice.feasible, advice.num_steps
       (True, 628)
 
-    Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P.
-      Henrici, Discrete Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
+    Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P. Henrici, Discrete
+      Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
     y0 = _check.state("y0", y0)
-    for name, value in (("t0", t0), ("t1", t1)):
-        _check.number(name, value)
-    if not float(t1) > float(t0):
-        raise ValueError(f"t1 must be later than t0={float(t0):g}, got {float(t1):g}")
+    _check.untraced("advise_step", y0, args, t0, t1, error)
+    t0, t1 = _check.interval(t0, t1)
     _check.positive("error", error)
-    if any(map(_check.is_traced, jax.tree.leaves((y0, args)))):
-        raise ValueError("advise_step must be called with values, got traced ones; call it outside jit, grad, vmap")
     _check.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if max_pilot_steps is None:
         max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))
@@ -121,8 +115,8 @@ def advise_step(
     search = Search(
         f,
         y0,
-        float(t0),
-        float(t1),
+        t0,
+        t1,
         args,
         step,
         float(error),

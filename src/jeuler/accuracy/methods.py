@@ -1,5 +1,4 @@
-"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given
-times."""
+"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given times."""
 
 from __future__ import annotations
 
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler import _tree
 from jeuler.accuracy.timing import counting
 from jeuler.adaptive import solve_adaptive
 from jeuler.extrapolation import ExtrapolatedStep
@@ -60,21 +60,21 @@ def is_adaptive(method: Any) -> bool:
 def named(steps: Any) -> dict[str, Any]:
     """``steps`` as a dictionary: a mapping as it is, a sequence by the names of its functions."""
     if isinstance(steps, Mapping):
-        named = dict(steps)
+        methods = dict(steps)
     else:
         steps = [steps] if callable(steps) or is_diffrax(steps) else list(steps)
-        named = {getattr(s, "__name__", type(s).__name__).removesuffix("_step"): s for s in steps}
-        if len(named) < len(steps):
+        methods = {getattr(s, "__name__", type(s).__name__).removesuffix("_step"): s for s in steps}
+        if len(methods) < len(steps):
             raise ValueError("steps given as a list must have different names; pass a dict {name: step}")
-    for name, method in named.items():
+    for name, method in methods.items():
         inner = method.step if isinstance(method, Compensated) else method
         if not (callable(inner) or is_diffrax(inner)):
             raise ValueError(
                 f"steps[{name!r}] must be a step (f, t, y, dt, args) -> y or a diffrax solver, got {method!r}"
             )
-    if not named:
+    if not methods:
         raise ValueError("steps must name at least one method, got none")
-    return named
+    return methods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,18 +103,9 @@ class FixedRun:
         if is_diffrax(self.method):
             import diffrax
 
-            times = jnp.asarray(self.times, _time_dtype(y0))
-            return _diffrax(
-                f,
-                y0,
-                args,
-                self.method,
-                times,
-                self.dt,
-                diffrax.ConstantStepSize(),
-                self.num_steps + 8,
-                adjoint,
-            )
+            times = jnp.asarray(self.times, _tree.time_dtype(y0))
+            equal, most = diffrax.ConstantStepSize(), self.num_steps + 8
+            return _diffrax(f, y0, args, self.method, times, self.dt, equal, most, adjoint)
         compensated = isinstance(self.method, Compensated)
         run = solve(
             f,
@@ -163,7 +154,7 @@ class AdaptiveRun:
         import diffrax
 
         controller = diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance)
-        times = jnp.asarray(self.times, _time_dtype(y0))
+        times = jnp.asarray(self.times, _tree.time_dtype(y0))
         return _diffrax(f, y0, args, self.method, times, None, controller, MOST_ADAPTIVE_STEPS, adjoint)
 
 
@@ -188,25 +179,17 @@ def _diffrax(f, y0, args, solver, times, dt0, controller, most, adjoint):
     return run.ys, failed, run.stats["num_steps"]
 
 
-def _time_dtype(y0: PyTree) -> Any:
-    return np.result_type(np.float32, *(np.finfo(leaf.dtype).dtype for leaf in jax.tree.leaves(y0)))
-
-
 def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
     """The run whose dt is nearest to the one asked for and divides the interval."""
     num_steps = max(1, round((t1 - t0) / dt))
     return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
 
 
-def evaluations(
-    plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree
-) -> list[Callable]:
-    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps
-    are taken.
+def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[Callable]:
+    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps are taken.
 
-    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and
-    scaled to the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not
-    counted.
+    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and scaled to
+    the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not counted.
     """
 
     def counter(make_run: Callable) -> Callable:
@@ -223,7 +206,8 @@ def evaluations(
         return counter(lambda dt: FixedRun(plan[0].method, plan[0].t0, dt, num_steps))
 
     four, eight = fixed(4), fixed(8)
-    adaptive = counter(lambda tolerance: dataclasses.replace(run, tolerance=tolerance))
+    adaptive_runs = [run for run in plan if isinstance(run, AdaptiveRun)]
+    adaptive = counter(lambda tolerance: dataclasses.replace(adaptive_runs[0], tolerance=tolerance))
     laws = []
     for run in plan:
         if isinstance(run, AdaptiveRun):

@@ -1,5 +1,4 @@
-"""Pilot runs: the final state for any number of steps from one compiled program, and what a ladder of them
-says."""
+"""Pilot runs: the final state for any number of steps from one compiled program, and what a ladder of them says."""
 
 from __future__ import annotations
 
@@ -64,8 +63,7 @@ class Pilot:
 
 @dataclasses.dataclass
 class Ladder:
-    """Final states for numbers of steps that double, and their extrapolation to dt = 0 (Richardson,
-    Aitken-Neville).
+    """Final states for numbers of steps that double, and their extrapolation to dt = 0 (Richardson, Aitken-Neville).
 
     T_{j,m+1} = T_{j,m} + (T_{j,m} - T_{j-1,m}) / (2^(p+m-1) - 1),  p the order of the step
     """

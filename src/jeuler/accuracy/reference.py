@@ -1,5 +1,4 @@
-"""What errors are measured against: an exact solution, a given one, or an accurate solver; always in
-float64."""
+"""What errors are measured against: an exact solution, a given one, or an accurate solver; always in float64."""
 
 from __future__ import annotations
 
@@ -25,8 +24,8 @@ class Reference:
     Attributes:
       times: (time,), s.
       states: (time, number), the numbers of y in one row each; NaN where nothing is known.
-      error: how far the states may be trusted: the norm of the last one's change from the looser tolerance;
-        0.0 for an exact or a given reference.
+      error: how far the states may be trusted: the norm of the last one's change from the looser tolerance; 0.0 for an
+        exact or a given reference.
     """
 
     times: np.ndarray
@@ -70,8 +69,7 @@ def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, tim
 
 
 def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, tolerance: Any) -> PyTree:
-    """States at the times by an adaptive diffrax solver that steps exactly to each of them.
-    Differentiable."""
+    """States at the times by an adaptive diffrax solver that steps exactly to each of them. Differentiable."""
     import diffrax
 
     control = diffrax.PIDController(rtol=tolerance, atol=tolerance * max(np.linalg.norm(flat(y0)), 1e-3))
@@ -118,8 +116,7 @@ def make_reference_gradient(
 
 
 def error_norms(states: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Euclidean norms of the error over all numbers of the state: at the end, largest, and root mean square
-    in time."""
+    """Euclidean norms of the error over all numbers of the state: at the end, largest, and root mean square in time."""
     error, size = np.linalg.norm(states - reference, axis=1), np.linalg.norm(reference, axis=1)
     weights = np.ones(len(error))
     weights[[0, -1]] = 0.5  # the trapezoidal rule on even times
@@ -128,7 +125,5 @@ def error_norms(states: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     scale = {"final": float(size[-1]), "max": float(size.max()), "l2": mean_square(size)}
     norms = {f"error_{name}": value for name, value in absolute.items()}
     with np.errstate(divide="ignore", invalid="ignore"):
-        norms |= {
-            f"error_{name}_relative": float(np.divide(absolute[name], scale[name])) for name in absolute
-        }
+        norms |= {f"error_{name}_relative": float(np.divide(absolute[name], scale[name])) for name in absolute}
     return norms

@@ -23,8 +23,8 @@ FACTOR = 3.0  # an error within this factor of the target is near it
 MARGIN = 0.01  # by which dt may be larger with the error still near the target
 FINENESS = 1e-3  # part of the number of steps below which the search makes no difference
 TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
-ROUGH = 2**18  # steps of the longest run in float32
 REGULAR = 0.25  # and the observed order be this close to the step's own, to predict beyond the pilots
+ROUGH = 2**18  # steps of the longest run in float32
 
 
 class Search:
@@ -78,8 +78,7 @@ class Search:
                 self.stability, self.bound = min(self.stability, limit), min(self.bound, bound)
 
     def climb(self, num_steps: int) -> Ladder | None:
-        """Double the steps until the error of the finest run is known and either meets the target or follows
-        the order."""
+        """Double the steps until the finest run's error is known, and meets the target or follows the order."""
         ladder, looked = Ladder(self.order), False
         while num_steps <= self.most:
             states = self.pilot(num_steps)
@@ -95,8 +94,7 @@ class Search:
         return None
 
     def _trusted(self, ladder: Ladder) -> bool:
-        """Whether the extrapolated state is known well enough, now and one run before, to judge the
-        target."""
+        """Whether the extrapolated state is known well enough, now and one run before, to judge the target."""
         if ladder.best is None or not np.all(np.isfinite(ladder.best)):
             return False
         target, error = self.target(ladder), ladder.errors()[-1]
@@ -159,8 +157,7 @@ class Search:
         return high, error_high
 
     def implicit_steps(self, ladder: Ladder, fewer_than: int) -> int | None:
-        """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that
-        few."""
+        """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that few."""
         run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.target(ladder)
         num_steps, met = 1, False
         while num_steps < min(fewer_than, self.most // 16):

@@ -50,8 +50,7 @@ class Summary:
       order: slope of log error against log dt, from the points above the floor; NaN with fewer than two.
       roundoff_floor: the error below which more steps do not get; NaN if the sweep did not reach it.
       floor_dt: the dt at which more steps stop helping, s; NaN if the sweep did not reach it.
-      stability_limit: largest stable dt at the initial state, s; inf if none, 0.0 if no dt is, NaN if
-        unknown.
+      stability_limit: largest stable dt at the initial state, s; inf if none, 0.0 if no dt is, NaN if unknown.
     """
 
     method: str
@@ -97,11 +96,7 @@ class WorkPrecision:
     def series(self) -> Iterator[tuple[str, str, list[dict[str, Any]]]]:
         """(method, dtype, its fixed-step rows from coarse to fine)."""
         for method, dtype in dict.fromkeys((row["method"], row["dtype"]) for row in self.rows):
-            own = [
-                r
-                for r in self.rows
-                if (r["method"], r["dtype"]) == (method, dtype) and math.isfinite(r["dt"])
-            ]
+            own = [r for r in self.rows if (r["method"], r["dtype"]) == (method, dtype) and math.isfinite(r["dt"])]
             yield method, dtype, sorted(own, key=lambda row: -row["dt"])
 
     @property
@@ -125,13 +120,10 @@ class WorkPrecision:
             writer = csv.DictWriter(file, list(EMPTY_ROW))
             writer.writeheader()
             for row in self.rows:
-                writer.writerow(
-                    {k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()}
-                )
+                writer.writerow({k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()})
 
     def to_markdown(self) -> str:
-        """One line a method and dt (or tolerance); each precision has its columns. Bold: on the Pareto
-        front."""
+        """One line a method and dt (or tolerance); each precision has its columns. Bold: on the Pareto front."""
         dtypes = list(dict.fromkeys(row["dtype"] for row in self.rows))
         gradient = any(math.isfinite(row["gradient_error"]) for row in self.rows)
         columns = [
@@ -179,8 +171,7 @@ def _count(n: int) -> str:
 
 
 def mark_pareto(rows: list[dict[str, Any]]) -> None:
-    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no
-    result."""
+    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no result."""
     for row in rows:
         row["pareto"] = False
     best = math.inf
@@ -191,11 +182,10 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
 
 
 def roundoff_floor(dt: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """The error at which halving dt no longer takes a third off it, and that dt; NaN where that never
-    happens.
+    """The error at which halving dt no longer takes a third off it, and that dt; NaN where that never happens.
 
-    dt falls. The floor begins at the largest dt for which every dt of half its size or less has at least 2/3
-    of its error.
+    dt falls. The floor begins at the largest dt for which every dt of half its size or less has at least 2/3 of its
+    error.
     """
     for i in range(len(dt)):
         finer = error[dt <= dt[i] / 2 * (1 + 1e-6)]
@@ -209,8 +199,8 @@ def fitted_order(
 ) -> float:
     """Least-squares slope of log error over log dt from the finest four points that are above the floor.
 
-    Above the floor: dt > floor_dt and four times the floor; and not beyond 30 % relative error, where no
-    power law holds.
+    Above the floor: dt > floor_dt and four times the floor; and not beyond 30 % relative error, where no power law
+    holds.
     """
     use = np.isfinite(error) & (error > 0) & ~(relative > 0.3)
     if math.isfinite(floor):

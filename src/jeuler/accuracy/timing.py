@@ -19,8 +19,7 @@ class Measurement:
       result: what it returned.
       compile_seconds: tracing, lowering and compiling it.
       run_seconds: each repeat, first run excluded, in the order measured; waits for the result.
-      temporary_bytes: peak memory beside inputs and outputs, as the compiler planned it; -1 if it does not
-        say.
+      temporary_bytes: peak memory beside inputs and outputs, as the compiler planned it; -1 if it does not say.
     """
 
     result: Any
@@ -62,8 +61,7 @@ def measure(
 
 
 def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
-    """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and
-    reset it."""
+    """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and reset it."""
     count = 0
 
     def add_one(_: Any) -> None:
@@ -71,9 +69,7 @@ def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
         count += 1
 
     def counted(t, y, args):
-        jax.debug.callback(
-            add_one, (t, jax.tree.leaves(y))
-        )  # depends on all, so that vmap calls it once a member
+        jax.debug.callback(add_one, (t, jax.tree.leaves(y)))  # depends on all, so that vmap calls it once a member
         return f(t, y, args)
 
     def read() -> int:

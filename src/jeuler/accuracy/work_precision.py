@@ -58,18 +58,17 @@ def work_precision(
 
         error(dt) = |y_dt(t) - y(t)|,  at t1, at its largest, and as a root mean square over the saved times
 
-    The steps are equal: each dt becomes the nearest one that divides t1 - t0. Every program is compiled ahead
-    (compile seconds apart), run once unmeasured, then measured ``repeats`` times. A run that blows up, or
-    that would take longer than ``timeout`` by the speed of the coarser ones before it, is a row of NaN with
-    its reason.
+    The steps are equal: each dt becomes the nearest one that divides t1 - t0. Every program is compiled ahead (compile
+    seconds apart), run once unmeasured, then measured ``repeats`` times. A run that blows up, or that would take longer
+    than ``timeout`` by the speed of the coarser ones before it, is a row of NaN with its reason.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
       y0: initial state, any pytree of floating or complex arrays.
       t1: final time, s.
       dts: step sizes, s.
-      steps: ``{name: method}``, or a sequence of steps. A method is a step ``(f, t, y, dt, args) -> y``, such
-        a step with compensated sums, ``Compensated(euler_step)``, or a diffrax solver.
+      steps: ``{name: method}``, or a sequence of steps. A method is a step ``(f, t, y, dt, args) -> y``, such a step
+        with compensated sums, ``Compensated(euler_step)``, or a diffrax solver.
       reference: the exact solution, a function of t; or the state at t1; or a diffrax solver, run at tight
         tolerance (take a stiff one for a stiff problem); None runs ``diffrax.Dopri8``. Always in float64.
       t0: initial time, s.
@@ -77,8 +76,8 @@ def work_precision(
       dtypes: precisions to run in, such as ("float32", "float64"); None takes that of y0.
       tolerances: for methods that choose their own steps, adaptive diffrax solvers and `extrapolated_euler`,
         further rows at these tolerances, relative and absolute alike; no fixed dt.
-      gradient: a scalar function of the final state; each row then also has the error, seconds and bytes of
-        its reverse-mode derivative with respect to args.
+      gradient: a scalar function of the final state; each row then also has the error, seconds and bytes of its
+        reverse-mode derivative with respect to args.
       repeats: measured runs in each row.
       timeout: longest run allowed, s.
       adjoint: how diffrax differentiates, a ``diffrax.AbstractAdjoint``; None takes its default.
@@ -93,14 +92,17 @@ def work_precision(
       >>> [(row["method"], row["num_steps"], round(row["error_final"], 4)) for row in table.rows]
       [('Euler', 10, 0.0192), ('Euler', 20, 0.0094)]
 
-    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.10,
-      work-precision diagrams.
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.10, work-precision
+      diagrams.
     """
     from tqdm.auto import tqdm
 
     y0 = _check.state("y0", y0)
-    t0, t1 = _checked_interval(t0, t1)
+    _check.untraced("work_precision", y0, args, t0, t1)
+    t0, t1 = _check.interval(t0, t1)
     dts = _positive_values("dts", dts, "s")
+    if not dts:
+        raise ValueError("dts must name at least one step size, got none")
     tolerances = _positive_values("tolerances", tolerances)
     repeats = _check.count("repeats", repeats, least=1)
     _check.positive("timeout", timeout, "s")
@@ -144,13 +146,9 @@ def work_precision(
     return WorkPrecision(rows=rows, stability_limits=limits, reference_error=truth.error, interval=(t0, t1))
 
 
-def _plan(
-    method: Any, t0: float, t1: float, dts: list[float], tolerances: list[float]
-) -> list[FixedRun | AdaptiveRun]:
+def _plan(method: Any, t0: float, t1: float, dts: list[float], tolerances: list[float]) -> list[FixedRun | AdaptiveRun]:
     """The runs of a method from coarse to fine, each grid once."""
-    fixed = {
-        run.num_steps: run for run in (fixed_grid(method, t0, t1, dt) for dt in sorted(dts, reverse=True))
-    }
+    fixed = {run.num_steps: run for run in (fixed_grid(method, t0, t1, dt) for dt in sorted(dts, reverse=True))}
     loose_first = sorted(tolerances, reverse=True) if is_adaptive(method) else []
     return [*fixed.values(), *(AdaptiveRun(method, t0, t1, tolerance) for tolerance in loose_first)]
 
@@ -162,9 +160,7 @@ def _row(run, problem, truth: Reference, pace: float, repeats: int, timeout: flo
     else:
         row = {"dt": run.dt, "num_steps": run.num_steps}
         if pace * run.num_steps > timeout:
-            return row | {
-                "reason": f"would take {pace * run.num_steps:.3g} s, more than timeout={timeout:g} s"
-            }
+            return row | {"reason": f"would take {pace * run.num_steps:.3g} s, more than timeout={timeout:g} s"}
     try:
         cost = measure(lambda y0, args: run(f, y0, args), y0, args, repeats=repeats, patience=timeout)
     except RuntimeError as failure:  # what an implicit solve raises at run time
@@ -186,9 +182,7 @@ def _row(run, problem, truth: Reference, pace: float, repeats: int, timeout: flo
     return row | error_norms(states, truth.at(run.times))
 
 
-def _gradient_row(
-    run, problem, scalar, truth: ReferenceGradient, repeats, timeout, adjoint
-) -> dict[str, Any]:
+def _gradient_row(run, problem, scalar, truth: ReferenceGradient, repeats, timeout, adjoint) -> dict[str, Any]:
     f, y0, args = problem
 
     def final(args):
@@ -222,20 +216,8 @@ def _limit(method: Any, f: VectorField, t0: float, y0: PyTree, args: PyTree) -> 
         return math.nan
 
 
-def _checked_interval(t0: Any, t1: Any) -> tuple[float, float]:
-    _check.number("t0", t0)
-    _check.number("t1", t1)
-    if not float(t1) > float(t0):
-        raise ValueError(f"t1 must be later than t0={float(t0):g}, got {float(t1):g}")
-    return float(t0), float(t1)
-
-
 def _positive_values(name: str, values: Any, unit: str = "") -> list[float]:
-    values = (
-        np.atleast_1d(np.asarray(values, dtype=float)).ravel().tolist() if np.ndim(values) < 2 else [math.nan]
-    )
+    values = np.atleast_1d(np.asarray(values, dtype=float)).ravel().tolist() if np.ndim(values) < 2 else [math.nan]
     for value in values:
         _check.positive(f"each of {name}", value, unit)
-    if name == "dts" and not values:
-        raise ValueError("dts must name at least one step size, got none")
     return values

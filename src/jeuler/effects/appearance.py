@@ -9,7 +9,8 @@ import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
-from jeuler.forces.springs import direction
+from jeuler._vectors import direction
+from jeuler.forces.fields import per_particle
 from jeuler.state import DEFAULTS
 
 
@@ -54,12 +55,8 @@ class OverLife:
             raise ValueError(
                 f"OverLife.times must have one time for each of the {len(self.values)} values, got {self.times.shape}"
             )
-        if (
-            self.times is not None
-            and not _check.is_traced(self.times)
-            and not (np.diff(np.asarray(self.times)) > 0).all()
-        ):
-            raise ValueError(f"OverLife.times must increase, got {self.times.tolist()}")
+        if self.times is not None:
+            _check.increasing("OverLife.times", self.times)
         if self.duration is not None:
             _check.positive("OverLife.duration", self.duration, "s")
 
@@ -139,10 +136,9 @@ class SpeedLimit:
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         speed, heading = direction(state.velocity)
-        limit = self.limit[:, None] if self.limit.ndim else self.limit
+        limit = per_particle(self.limit)
         slow = jnp.where(speed > limit, limit * heading, state.velocity)
         return state.replace(velocity=slow.astype(state.velocity.dtype))
 
     def check(self, particles: int, dim: int) -> None:
-        if self.limit.shape not in ((), (particles,)):
-            raise ValueError(f"SpeedLimit.limit must have shape () or ({particles},), got {self.limit.shape}")
+        _check.shape("SpeedLimit.limit", self.limit.shape, (), (particles,))

@@ -41,11 +41,10 @@ class SampledPath:
         times = self.times
         if times.ndim != 1 or len(times) < 2 or len(self.positions) != len(times):
             raise ValueError(
-                f"times must have shape (sample,) with two samples at least and positions (sample, ...), "
+                f"SampledPath.times must have shape (sample,) with two samples at least and positions (sample, ...), "
                 f"got {times.shape} and {self.positions.shape}"
             )
-        if not _check.is_traced(times) and not (np.diff(np.asarray(times)) > 0).all():
-            raise ValueError("times must increase from sample to sample; sort the samples and drop repeated times")
+        _check.increasing("SampledPath.times", times)
 
     def __call__(self, t: Any) -> Array:
         return interpolate(t, self.times, self.positions, slopes(self.times, self.positions))
@@ -114,7 +113,4 @@ class PrescribedMotion:
                 f"PrescribedMotion.particles must be different indices from 0 to {particles - 1}, got {list(indices)}"
             )
         shape = jax.eval_shape(self.path, jnp.zeros(())).shape
-        if shape != (len(indices), dim):
-            raise ValueError(
-                f"PrescribedMotion.path(t) must have shape ({len(indices)}, {dim}), (prescribed, dim), got {shape}"
-            )
+        _check.shape("PrescribedMotion.path(t)", shape, (len(indices), dim), meaning="(prescribed, dim)")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 import jax
@@ -11,14 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _check, _tree
+from jeuler import _check
 from jeuler._interpolate import hermite
 from jeuler.fitting.fit import fit
+from jeuler.fitting.observations import amplitude_of, checked_observations, horizons, place_in_steps, speed_of
+from jeuler.fitting.parameters import is_positive, put_parameters, read_parameters, values_in_forces
 from jeuler.methods import Step, rk4_step
 from jeuler.particles import ParticleState, Scene, simulate
 
 PyTree = Any
-STATE_PARAMETERS = ("mass", "velocity", "position", "anchors")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +129,7 @@ def fit_springs(
     scene.check(state)
     _check.positive("dt", dt, "s")
     _check.number("t0", t0)
-    times, targets = _observations(times, positions, state.position.shape, float(t0))
+    times, targets = checked_observations(times, positions, state.position.shape, float(t0))
     needed = max(1, int(np.ceil((times[-1] - t0) / dt * (1 - 1e-12))))
     num_steps = needed if num_steps is None else _check.count("num_steps", num_steps, least=1)
     if num_steps < needed:
@@ -139,12 +139,12 @@ def fit_springs(
         )
     observed = np.nonzero(np.isfinite(targets))
     observed_targets = targets[observed]
-    interval, s = _place(times, t0, dt, num_steps)
-    start = _read(scene, state, parameters)
-    amplitude = _amplitude(targets)
+    interval, s = place_in_steps(times, t0, dt, num_steps)
+    start = read_parameters(scene, state, parameters)
+    amplitude = amplitude_of(targets)
 
     def predict(params: dict[str, Any]) -> Array:
-        fitted_scene, fitted_state = _put(scene, state, params)
+        fitted_scene, fitted_state = put_parameters(scene, state, params)
         run = simulate(
             fitted_scene,
             fitted_state,
@@ -162,154 +162,24 @@ def fit_springs(
         predicted = predict(params)
         return predicted[observed] - jnp.asarray(observed_targets, predicted.dtype)
 
-    stages = _horizons(times[observed[0]] - t0) if grow else ()
+    stages = horizons(times[observed[0]] - t0) if grow else ()
     result = fit(
         residual,
         start,
-        positive={name: _is_positive(name) for name in start},
-        scale={name: _speed(times, targets) if name == "velocity" else amplitude for name in start},
+        positive={name: is_positive(name) for name in start},
+        scale={name: speed_of(times, targets) if name == "velocity" else amplitude for name in start},
         optimizer=optimizer,
         max_iterations=max_iterations,
         tolerance=tolerance,
         stages=stages,
         progress=progress,
     )
-    fitted_scene, fitted_state = _put(scene, state, result.params)
+    fitted_scene, fitted_state = put_parameters(scene, state, result.params)
     return SpringFit(
-        ks=_of_springs(fitted_scene, "ks"),
-        kd=_of_springs(fitted_scene, "kd"),
+        ks=values_in_forces(fitted_scene, "ks"),
+        kd=values_in_forces(fitted_scene, "kd"),
         scene=fitted_scene,
         state=fitted_state,
         predicted=jax.jit(predict)(result.params),
         **{field.name: getattr(result, field.name) for field in dataclasses.fields(result)},
     )
-
-
-def _observations(times: Any, positions: Any, shape: tuple[int, ...], t0: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times and targets as float64 NumPy arrays, checked."""
-    times, targets = np.asarray(times, float), np.asarray(positions, float)
-    if times.ndim != 1 or not len(times):
-        raise ValueError(f"times must have shape (time,) with at least one time, got {times.shape}")
-    if targets.shape != (len(times), *shape):
-        raise ValueError(
-            f"positions must have shape (time, particle, dim) = {(len(times), *shape)}, got {targets.shape}"
-        )
-    if not np.isfinite(times).all():
-        raise ValueError(f"times must be finite, got {times[~np.isfinite(times)][0]}; drop those rows")
-    falls = np.flatnonzero(np.diff(times) < 0)
-    if falls.size:
-        k = falls[0]
-        raise ValueError(f"times must not decrease, got {times[k]} then {times[k + 1]} at {k + 1}; sort the rows")
-    if times[0] < t0:
-        raise ValueError(
-            f"times must lie in the simulated span, which begins at t0 = {t0} s, got {times[0]}; "
-            f"pass t0, the time of the state, or drop the rows before it"
-        )
-    if np.isinf(targets).any():
-        raise ValueError("positions must be finite, or NaN where not observed, got inf")
-    if not np.isfinite(targets).any():
-        raise ValueError("positions must have at least one finite value, got none: nothing was observed")
-    return times, targets
-
-
-def _place(times: np.ndarray, t0: float, dt: float, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The step interval of each time and the place in it, from 0 to 1."""
-    steps = (times - t0) / dt
-    interval = np.clip(np.floor(steps).astype(int), 0, num_steps - 1)
-    return interval, steps - interval
-
-
-def _horizons(times: np.ndarray) -> list[np.ndarray]:
-    """Weights of the observations for a time horizon that doubles from a sixteenth of the span to a half."""
-    weights = [(times <= times[-1] * share).astype(float) for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
-    counts = [0.0, *(w.sum() for w in weights)]
-    return [w for w, before in zip(weights, counts, strict=False) if w.sum() > before and w.sum() < len(times)]
-
-
-def _amplitude(targets: np.ndarray) -> float:
-    """Root mean square of the motion about its mean, m."""
-    seen = np.isfinite(targets)
-    mean = np.nansum(targets, axis=0) / np.maximum(seen.sum(axis=0), 1)
-    rms = float(np.sqrt(np.mean((targets - mean)[seen] ** 2)))
-    return rms if rms > 0 else 1.0
-
-
-def _speed(times: np.ndarray, targets: np.ndarray) -> float:
-    """Root mean square speed over a fiftieth of the samples, so that noise does not pass for speed, m/s."""
-    lag = max(1, len(times) // 50)
-    if len(times) <= lag:
-        return 1.0
-    span = np.maximum(times[lag:] - times[:-lag], 1e-300)[:, None, None]
-    quotients = (targets[lag:] - targets[:-lag]) / span
-    rms = float(np.sqrt(np.nanmean(quotients**2))) if np.isfinite(quotients).any() else 0.0
-    return rms if np.isfinite(rms) and rms > 0 else 1.0
-
-
-def _free(state: ParticleState) -> np.ndarray:
-    """Which particles can move."""
-    return np.broadcast_to(np.isfinite(np.asarray(state.mass)), state.position.shape[:1])
-
-
-def _fields(force: Any) -> set[str]:
-    """The names of a force's parameters."""
-    if not dataclasses.is_dataclass(force):
-        return set()
-    return {field.name for field in dataclasses.fields(force)} - {"edges", "function"}
-
-
-def _owners(scene: Scene, name: str) -> tuple[list[int], str]:
-    """Which forces have the parameter "ks", or "forces[1].ks" for one of them, and its field's name."""
-    one = re.fullmatch(r"forces\[(\d+)\]\.(\w+)", name)
-    field = one.group(2) if one else name
-    owners = [k for k, force in enumerate(scene.forces) if field in _fields(force)]
-    return [k for k in owners if one is None or k == int(one.group(1))], field
-
-
-def _of_springs(scene: Scene, name: str) -> Any:
-    owners, field = _owners(scene, name)
-    values = tuple(getattr(scene.forces[k], field) for k in owners)
-    return values[0] if len(values) == 1 else values
-
-
-def _is_positive(name: str) -> bool:
-    return name.rpartition(".")[2] not in ("velocity", "position", "anchors", "acceleration")
-
-
-def _read(scene: Scene, state: ParticleState, parameters: tuple[str, ...]) -> dict[str, Any]:
-    """The starting values by name."""
-    if isinstance(parameters, str) or not parameters:
-        raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {parameters!r}')
-    free, dtype = _free(state), state.position.dtype
-    start: dict[str, Any] = {}
-    for name in parameters:
-        if _owners(scene, name)[0]:
-            start[name] = jax.tree.map(lambda x: jnp.asarray(x, dtype), _of_springs(scene, name))
-        elif name not in STATE_PARAMETERS:
-            known = sorted(set().union(*(_fields(force) for force in scene.forces)))
-            raise ValueError(f"parameters must be among {(*known, *STATE_PARAMETERS)} for this scene, got {name!r}")
-        elif name == "mass" and not state.mass.ndim:
-            start[name] = state.mass
-        else:
-            rows = np.flatnonzero(~free if name == "anchors" else free)
-            if not rows.size:
-                kind = "pinned (mass = inf)" if name == "anchors" else "free"
-                raise ValueError(f"parameters names {name!r}, but the state has no {kind} particle")
-            start[name] = getattr(state, "position" if name == "anchors" else name)[rows]
-    return start
-
-
-def _put(scene: Scene, state: ParticleState, params: dict[str, Any]) -> tuple[Scene, ParticleState]:
-    """Scene and state with the parameters put in."""
-    free = _free(state)
-    forces = list(scene.forces)
-    for name, value in params.items():
-        owners, field = _owners(scene, name)
-        for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
-            forces[k] = _tree.replace(forces[k], **{field: x})
-        if not owners and name == "mass" and not value.ndim:
-            state = _tree.replace(state, mass=value)
-        elif not owners:
-            field = "position" if name == "anchors" else name
-            rows = np.flatnonzero(~free if name == "anchors" else free)
-            state = _tree.replace(state, **{field: getattr(state, field).at[rows].set(value)})
-    return _tree.replace(scene, forces=tuple(forces)), state

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler.forces.air import at_time, moving
-from jeuler.forces.fields import per_particle
+from jeuler.forces.fields import mass_that_feels, per_particle
 
 
 @_tree.component(static=("power",))
@@ -52,9 +52,7 @@ class PointAttractor:
         d = at_time(self.center, t, position.dtype) - position
         square = jnp.sum(d * d, axis=1, keepdims=True) + self.softening.astype(position.dtype) ** 2
         acceleration = at_time(self.strength, t, position.dtype) * d * square ** (-(self.power + 1) / 2)
-        return per_particle(jnp.where(jnp.isfinite(mass), mass, 0)) * acceleration
+        return per_particle(mass_that_feels(mass)) * acceleration
 
     def check(self, particles: int, dim: int) -> None:
-        shape = jax.eval_shape(at_time, self.center, jnp.zeros(())).shape
-        if shape != (dim,):
-            raise ValueError(f"PointAttractor.center must have shape ({dim},), got {shape}")
+        _check.shape("PointAttractor.center", jax.eval_shape(at_time, self.center, jnp.zeros(())).shape, (dim,))

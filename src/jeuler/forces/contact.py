@@ -63,11 +63,7 @@ class PenaltyContact:
 
     def check(self, particles: int, dim: int) -> None:
         for name, shapes in (("ks", ((),)), ("kd", ((),)), ("radius", ((), (particles,)))):
-            shape = getattr(self, name).shape
-            if shape not in shapes:
-                raise ValueError(
-                    f"PenaltyContact.{name} must have shape {' or '.join(map(str, shapes))}, got {shape}"
-                )
+            _check.shape(f"PenaltyContact.{name}", getattr(self, name).shape, *shapes)
         for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("radius", "m")):
             _check.not_negative(f"PenaltyContact.{name}", getattr(self, name), unit)
         check_collider(self.collider, dim)

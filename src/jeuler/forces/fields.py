@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler._components import stack
 
 
@@ -16,13 +16,18 @@ def per_particle(x: Array) -> Array:
     return x[:, None] if x.ndim else x
 
 
+def mass_that_feels(mass: Array) -> Array:
+    """The mass, and 0 for a pinned particle (mass = inf), so that no inf reaches the sum of forces."""
+    return jnp.where(jnp.isfinite(mass), mass, 0)
+
+
 @_tree.component()
 class Gravity:
     """A uniform field.
 
         F_i = m_i g
 
-    A pinned particle (mass = inf) feels none, so that no inf reaches the sum of forces.
+    A pinned particle (mass = inf) feels none.
 
     Args:
       acceleration: g, shape (dim,), m/s^2. Differentiable.
@@ -42,18 +47,13 @@ class Gravity:
         _tree.store_as_float(self, "acceleration")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        weight = jnp.where(jnp.isfinite(mass), mass, 0)
-        weight = jnp.broadcast_to(weight, position.shape[:1])
+        weight = jnp.broadcast_to(mass_that_feels(mass), position.shape[:1])
         return stack([weight * g for g in self.acceleration.astype(position.dtype)])
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy -sum_i m_i g.p_i, J."""
-        weight = jnp.where(jnp.isfinite(mass), mass, 0)
-        return -jnp.sum(weight * (position @ self.acceleration.astype(position.dtype)))
+        return -jnp.sum(mass_that_feels(mass) * (position @ self.acceleration.astype(position.dtype)))
 
     def check(self, particles: int, dim: int) -> None:
-        if self.acceleration.shape != (dim,):
-            raise ValueError(
-                f"Gravity.acceleration must have shape ({dim},), one component for each of position's, "
-                f"got {self.acceleration.shape}"
-            )
+        shape = self.acceleration.shape
+        _check.shape("Gravity.acceleration", shape, (dim,), meaning="one component for each of position's")

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jeuler import _tree
-from jeuler.forces.neighbours import Indices, check_indices
-from jeuler.forces.springs import direction
+from jeuler import _check, _tree
+from jeuler._vectors import direction
+from jeuler.forces.topology import Indices, check_indices
 
 
 def strand_edges(strands: Any) -> np.ndarray:
@@ -22,6 +22,7 @@ def strand_edges(strands: Any) -> np.ndarray:
 
     Args:
       strands: particle indices along each strand from its root, integers (strand, node).
+    Returns: the pairs, integers (strand x (node - 1), 2).
     Raises: nothing of its own.
     Example:
       >>> import jeuler
@@ -218,5 +219,4 @@ def check_strands(name: str, strands: Any, rest_position: Array) -> None:
         raise ValueError(
             f"{name}.strands must have shape (strand, node) with three nodes at least, got {indices.shape}"
         )
-    if rest_position.shape != (*indices.shape, 3):
-        raise ValueError(f"{name}.rest_position must have shape {(*indices.shape, 3)}, got {rest_position.shape}")
+    _check.shape(f"{name}.rest_position", rest_position.shape, (*indices.shape, 3))

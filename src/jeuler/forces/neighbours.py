@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
-from jeuler.forces.springs import direction
-from jeuler.forces.topology import Topology
+from jeuler import _check, _tree
+from jeuler._vectors import direction
+from jeuler.forces.topology import Indices, Topology, check_indices
 
 
 @_tree.component(static=("edges",))
@@ -53,11 +53,8 @@ class Viscosity:
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
-        if self.coefficient.shape not in ((), (len(self.edges),)):
-            raise ValueError(
-                f"Viscosity.coefficient must have shape () or ({len(self.edges)},), one a pair, "
-                f"got {self.coefficient.shape}"
-            )
+        shape = self.coefficient.shape
+        _check.shape("Viscosity.coefficient", shape, (), (len(self.edges),), meaning="one a pair")
 
 
 def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
@@ -135,10 +132,7 @@ class Bending:
         check_indices("Bending.triples", self.triples, particles)
         for name in ("stiffness", "rest_angle"):
             shape = getattr(self, name).shape
-            if shape not in ((), (len(self.triples),)):
-                raise ValueError(
-                    f"Bending.{name} must have shape () or ({len(self.triples)},), one a triple, got {shape}"
-                )
+            _check.shape(f"Bending.{name}", shape, (), (len(self.triples),), meaning="one a triple")
 
 
 def reciprocal(length: Array) -> Array:
@@ -155,32 +149,3 @@ def angle_from(e: Array, f: Array, cosine: Array) -> tuple[Array, Array, Array]:
     theta = jnp.where(bent, jnp.atan2(sine, cosine), jnp.where(cosine > 0, 0, jnp.pi))
     ratio = jnp.where(bent, theta / sine, jnp.where(cosine > 0, 1 + square / 6, 0))
     return theta, ratio, jnp.where(bent, 1 / sine, 0)
-
-
-class Indices:
-    """Fixed particle indices, as part of the program: hashable and equal by content."""
-
-    def __init__(self, indices: Any) -> None:
-        self.indices = np.array(indices, np.int32)
-        self.indices.setflags(write=False)
-        self._key = (self.indices.shape, self.indices.tobytes())
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Indices) and self._key == other._key
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.indices, dtype=dtype)
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-
-def check_indices(name: str, indices: Any, particles: int) -> None:
-    indices = np.asarray(indices)
-    if indices.size and not 0 <= indices.min() <= indices.max() < particles:
-        raise ValueError(
-            f"{name} must be particle indices from 0 to {particles - 1}, got from {indices.min()} to {indices.max()}"
-        )

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
-from jeuler.forces.neighbours import Indices, check_indices
+from jeuler import _check, _tree
+from jeuler.forces.topology import Indices, check_indices
 
 
 @jax.custom_jvp
@@ -104,8 +104,4 @@ class ShapeMatching:
 
     def check(self, particles: int, dim: int) -> None:
         check_indices("ShapeMatching.particles", self.particles, particles)
-        if self.rest_position.shape[1] != dim:
-            raise ValueError(
-                f"ShapeMatching.rest_position must have shape ({len(self.particles)}, {dim}), "
-                f"got {self.rest_position.shape}"
-            )
+        _check.shape("ShapeMatching.rest_position", self.rest_position.shape, (len(self.particles), dim))

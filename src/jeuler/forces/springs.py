@@ -11,22 +11,10 @@ from jax import Array
 
 from jeuler import _check, _tree
 from jeuler._components import split, stack
+from jeuler._vectors import direction
 from jeuler.forces.incidence import stored
 from jeuler.forces.layouts import Layout
 from jeuler.forces.topology import Topology
-
-
-def direction(d: Array) -> tuple[Array, Array]:
-    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r =
-    0.
-
-    Ends closer than tiny^(1/3) (2e-13 in float32, 3e-103 in float64) count as coincident: below that, the
-    second derivative of r overflows.
-    """
-    square = jnp.sum(d * d, axis=-1, keepdims=True)
-    apart = square > jnp.finfo(d.dtype).tiny ** (2 / 3)
-    r = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
-    return r, jnp.where(apart, d / jnp.where(apart, r, 1), 0)
 
 
 @jax.custom_jvp
@@ -72,17 +60,14 @@ class Springs:
         d = p_i - p_j,  r = |d|,  u = d / r
         F_i = ks (L - r) u - kd ((v_i - v_j).u) u,   F_j = -F_i
 
-    At r = 0 the direction u is taken as 0: the force is finite, and with L = 0 it is 0 with derivative
-    exactly -ks I.
+    At r = 0 the direction u is taken as 0: the force is finite, and with L = 0 it is 0 with derivative exactly -ks I.
 
     Args:
-      edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May
-        be empty.
+      edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May be empty.
       ks: stiffness of each spring, shape () or (spring,), N/m. Differentiable.
       kd: damping of each spring, shape () or (spring,), N s/m. Differentiable.
       rest_length: L, length without force, shape () or (spring,), m. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim),
-      N.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in
       `simulate`, if an index is out of range, a parameter has another shape, or one that is not traced is negative.
     Example:
@@ -107,8 +92,7 @@ class Springs:
         return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
 
     def prepare(self, particles: int, dtype: Any) -> PreparedSprings:
-        """The same force with its parameters laid out for the kernels, which is the same work at every
-        step."""
+        """The same force with its parameters laid out for the kernels, which is the same work at every step."""
         layouts = self.edges.layouts(particles)
         parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
         slots = ([layout.to_slots(x) for layout in layouts] for x in parameters)
@@ -131,20 +115,15 @@ class Springs:
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
-        for name in ("ks", "kd", "rest_length"):
-            shape = getattr(self, name).shape
-            if shape not in ((), (len(self.edges),)):
-                raise ValueError(
-                    f"Springs.{name} must have shape () or ({len(self.edges)},), one a spring, got {shape}"
-                )
         for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("rest_length", "m")):
+            shape = getattr(self, name).shape
+            _check.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
             _check.not_negative(f"Springs.{name}", getattr(self, name), unit)
 
 
 @_tree.component(static=("edges", "layouts"))
 class PreparedSprings:
-    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and
-    group."""
+    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and group."""
 
     edges: Topology
     layouts: tuple[Layout, ...]

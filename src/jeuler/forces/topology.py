@@ -1,4 +1,4 @@
-"""Which particles are joined: a static graph, and the two linear maps between particles and springs."""
+"""Particles by their indices, fixed while tracing; joined in pairs, and the two linear maps from one to the other."""
 
 from __future__ import annotations
 
@@ -18,17 +18,57 @@ FEW = 8  # Pairs for less than one edge in so many particles,
 MANY = 8000  # and for less than so many edges: their arrays stay in the nearest caches, where scatters are cheap
 
 
-class Topology:
-    """The edges of a scene, fixed while tracing: hashable and equal by content, read as an integer array.
+class Indices:
+    """Particle indices, fixed while tracing: hashable and equal by content, read as an integer array."""
 
-    The signed incidence operator B takes a value at each particle to its difference along each edge,
-    (B x)_e = x_i - x_j for e = (i, j). Its transpose sums what each edge gives to its two ends, +f at i and
-    -f at j.
+    def __init__(self, indices: Any) -> None:
+        self.indices: np.ndarray = np.array(indices, dtype=np.int32)
+        self.indices.setflags(write=False)
+        self._key = (self.indices.shape, hashlib.sha1(self.indices.tobytes()).hexdigest())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._key == other._key
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.indices, dtype=dtype)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.indices[index]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.indices.shape
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(shape={self.shape})"
+
+
+def check_indices(name: str, indices: Any, particles: int) -> None:
+    """Every index is that of a particle."""
+    indices = np.asarray(indices)
+    if indices.size and not 0 <= indices.min() <= indices.max() < particles:
+        raise ValueError(
+            f"{name} must be particle indices from 0 to {particles - 1}, got from {indices.min()} to {indices.max()}"
+        )
+
+
+class Topology(Indices):
+    """The edges of a scene, (spring, 2).
+
+    The signed incidence operator B takes a value at each particle to its difference along each edge e = (i, j),
+
+        (B x)_e = x_i - x_j
+
+    Its transpose sums what each edge gives to its two ends, +f at i and -f at j.
     """
 
     def __init__(self, edges: Any) -> None:
-        if isinstance(edges, Topology):
-            edges = edges.edges
         edges = np.asarray(edges) if np.size(edges) else np.zeros((0, 2), np.int32)
         if edges.ndim != 2 or edges.shape[1] != 2:
             raise ValueError(f"edges must have shape (spring, 2), got {edges.shape}")
@@ -42,65 +82,40 @@ class Topology:
         if edges.min(initial=0) < 0:
             where = int(np.argmin(edges.min(axis=1)))
             raise ValueError(f"edges must be particle indices from 0, got edges[{where}] = {edges[where].tolist()}")
-        self.edges: np.ndarray = np.array(edges, dtype=np.int32)
-        self.edges.setflags(write=False)
-        self._key = (len(self.edges), hashlib.sha1(self.edges.tobytes()).hexdigest())
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Topology) and self._key == other._key
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.edges, dtype=dtype)
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        return self.edges[index]
-
-    def __len__(self) -> int:
-        return len(self.edges)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.edges.shape
-
-    def __repr__(self) -> str:
-        return f"Topology({len(self)} edges)"
+        super().__init__(edges)
 
     def check(self, particles: int) -> None:
         """Every edge joins particles that exist."""
-        out_of_range = np.flatnonzero((self.edges >= particles).any(axis=1))
+        out_of_range = np.flatnonzero((self.indices >= particles).any(axis=1))
         if out_of_range.size:
             first = out_of_range[0]
             raise ValueError(
                 f"edges must be indices below the number of particles, {particles}, "
-                f"got edges[{first}] = {self.edges[first].tolist()}"
+                f"got edges[{first}] = {self[first].tolist()}"
             )
 
     def layouts(self, particles: int) -> tuple[Layout, ...]:
         """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
 
-        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that
-        is if there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the
-        commonest first. Of the others, if they are less than MANY, or less than one in FEW particles, `Pairs`, else
-        `Rows`.
+        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
+        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. Of
+        the others, if they are less than MANY, or less than one in FEW particles, `Pairs`, else `Rows`.
         """
         return _layouts(self, particles)
 
     def difference(self, x: Array) -> Array:
         """B x: (particle, dim) to (spring, dim)."""
-        return x[self.edges[:, 0]] - x[self.edges[:, 1]]
+        return x[self[:, 0]] - x[self[:, 1]]
 
     def accumulate(self, force: Array, particles: int) -> Array:
         """B^T f: (spring, dim) to (particle, dim)."""
         total = jnp.zeros((particles, *force.shape[1:]), force.dtype)
-        return total.at[self.edges[:, 0]].add(force).at[self.edges[:, 1]].add(-force)
+        return total.at[self[:, 0]].add(force).at[self[:, 1]].add(-force)
 
 
 @functools.lru_cache(maxsize=64)
 def _layouts(topology: Topology, particles: int) -> tuple[Layout, ...]:
-    edges, numbers = topology.edges, np.arange(len(topology))
+    edges, numbers = topology.indices, np.arange(len(topology))
     if not len(edges):
         return ()
     offset = np.abs(edges[:, 1] - edges[:, 0])

@@ -64,9 +64,7 @@ def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list]:
                 _limits(axes[1], table, method, dtype, colours(index))
     front = [r for r in table.rows if r["pareto"] and r["dtype"] in dtypes and _drawable(r)]
     x, y = ([r[column] for r in front] for column in ("run_seconds_min", "error_final_relative"))
-    axes[0].loglog(
-        x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8
-    )
+    axes[0].loglog(x, y, "o", markersize=9, markerfacecolor="none", markeredgecolor="0.3", markeredgewidth=0.8)
     axes[0].set(xlabel="time of one run", ylabel="relative error at the end")
     if len(axes) == 2:
         axes[1].set(xlabel="dt, s")
@@ -144,8 +142,7 @@ def axes_or_new(ax: Any, size: tuple[float, float] = (7, 4.2)) -> Any:
 
 
 def label_ends(axes: Any, labels: list[tuple[float, float, str, Any]]) -> None:
-    """Write the labels in a column beside the axes, in the order of the points, each joined to its own by a
-    thin line.
+    """Write the labels in a column beside the axes, in the order of the points, each joined to its own by a thin line.
 
     labels: x, y (data), text, colour.
     """

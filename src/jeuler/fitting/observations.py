@@ -1,0 +1,69 @@
+"""What was measured: checked, placed among the steps of a run, and the scales that a fit takes from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def checked_observations(
+    times: Any, positions: Any, shape: tuple[int, ...], t0: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times and targets as float64 NumPy arrays, checked."""
+    times, targets = np.asarray(times, float), np.asarray(positions, float)
+    if times.ndim != 1 or not len(times):
+        raise ValueError(f"times must have shape (time,) with at least one time, got {times.shape}")
+    if targets.shape != (len(times), *shape):
+        raise ValueError(
+            f"positions must have shape (time, particle, dim) = {(len(times), *shape)}, got {targets.shape}"
+        )
+    if not np.isfinite(times).all():
+        raise ValueError(f"times must be finite, got {times[~np.isfinite(times)][0]}; drop those rows")
+    falls = np.flatnonzero(np.diff(times) < 0)
+    if falls.size:
+        k = falls[0]
+        raise ValueError(f"times must not decrease, got {times[k]} then {times[k + 1]} at {k + 1}; sort the rows")
+    if times[0] < t0:
+        raise ValueError(
+            f"times must lie in the simulated span, which begins at t0 = {t0} s, got {times[0]}; "
+            f"pass t0, the time of the state, or drop the rows before it"
+        )
+    if np.isinf(targets).any():
+        raise ValueError("positions must be finite, or NaN where not observed, got inf")
+    if not np.isfinite(targets).any():
+        raise ValueError("positions must have at least one finite value, got none: nothing was observed")
+    return times, targets
+
+
+def place_in_steps(times: np.ndarray, t0: float, dt: float, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """The step interval of each time and the place in it, from 0 to 1."""
+    steps = (times - t0) / dt
+    interval = np.clip(np.floor(steps).astype(int), 0, num_steps - 1)
+    return interval, steps - interval
+
+
+def horizons(times: np.ndarray) -> list[np.ndarray]:
+    """Weights of the observations for a time horizon that doubles from a sixteenth of the span to a half."""
+    weights = [(times <= times[-1] * share).astype(float) for share in (1 / 16, 1 / 8, 1 / 4, 1 / 2)]
+    counts = [0.0, *(w.sum() for w in weights)]
+    return [w for w, before in zip(weights, counts, strict=False) if w.sum() > before and w.sum() < len(times)]
+
+
+def amplitude_of(targets: np.ndarray) -> float:
+    """Root mean square of the motion about its mean, m."""
+    seen = np.isfinite(targets)
+    mean = np.nansum(targets, axis=0) / np.maximum(seen.sum(axis=0), 1)
+    rms = float(np.sqrt(np.mean((targets - mean)[seen] ** 2)))
+    return rms if rms > 0 else 1.0
+
+
+def speed_of(times: np.ndarray, targets: np.ndarray) -> float:
+    """Root mean square speed over a fiftieth of the samples, so that noise does not pass for speed, m/s."""
+    lag = max(1, len(times) // 50)
+    if len(times) <= lag:
+        return 1.0
+    span = np.maximum(times[lag:] - times[:-lag], 1e-300)[:, None, None]
+    quotients = (targets[lag:] - targets[:-lag]) / span
+    rms = float(np.sqrt(np.nanmean(quotients**2))) if np.isfinite(quotients).any() else 0.0
+    return rms if np.isfinite(rms) and rms > 0 else 1.0
