@@ -48,3 +48,21 @@ def test_moving_sphere():
     normal, speed = normal_and_speed(moving, 0.5, jnp.array([5.0, 0.0]))
     np.testing.assert_allclose(normal, [1, 0])
     np.testing.assert_allclose(speed, -2)  # it comes nearer by 2 m/s
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        (Sphere([0.0, 0.0], -1.0), "Sphere.radius must be at least 0 m, got -1"),
+        (Box([0.0, 0.0], [1.0, -2.0]), "Box.half_size must be at least 0 m"),
+        (Plane([0.0, 0.0], [0.0, 0.0]), "Plane.normal must point somewhere"),
+    ],
+)
+def test_impossible_shape_is_refused(shape, message):
+    with pytest.raises(ValueError, match=message):
+        shape.check(2)
+
+
+def test_words_for_numbers_are_refused_by_name():
+    with pytest.raises(ValueError, match="Sphere.radius must be a number, .* got 'large'"):
+        Sphere([0.0, 0.0], "large")

@@ -287,3 +287,8 @@ def test_nothing_is_mutated():
     y0 = np.ones(3)
     jeuler.solve(growth, y0, dt=0.1, num_steps=3, args=1.0)
     np.testing.assert_array_equal(y0, np.ones(3))
+
+
+def test_name_of_a_step_is_not_a_step():
+    with pytest.raises(ValueError, match="step must be a function .* got 'euler'"):
+        jeuler.solve(lambda t, y, args: -y, 1.0, dt=0.1, num_steps=2, step="euler")

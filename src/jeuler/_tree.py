@@ -65,7 +65,13 @@ def as_float(x: ArrayLike | None) -> Array | None:
 def store_as_float(component: Any, *names: str) -> None:
     """For ``__post_init__``: replace the named fields by floating arrays."""
     for name in names:
-        object.__setattr__(component, name, as_float(getattr(component, name)))
+        value = getattr(component, name)
+        try:
+            value = as_float(value)
+        except (TypeError, ValueError):
+            where = f"{type(component).__name__}.{name}"
+            raise ValueError(f"{where} must be a number, or an array or list of numbers, got {value!r}") from None
+        object.__setattr__(component, name, value)
 
 
 @component(static=("function",))

@@ -11,9 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler._vectors import length, unit
 
 Collider = Callable[[Any, Array], Array]
@@ -43,6 +44,14 @@ class _Shape:
                 raise ValueError(
                     f"{type(self).__name__}.{name} must have shape ({dim},), one component for each of position's, "
                     f"got {shape}"
+                )
+            if callable(value) or _check.is_traced(value):
+                continue
+            if name in ("radius", "half_size") and not np.all(np.asarray(value) >= 0):
+                raise ValueError(f"{type(self).__name__}.{name} must be at least 0 m, got {value}")
+            if name == "normal" and not np.any(np.asarray(value)):
+                raise ValueError(
+                    f"{type(self).__name__}.normal must point somewhere, got {value}; it points out of the solid"
                 )
 
 

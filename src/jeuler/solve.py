@@ -232,6 +232,10 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
     Reverse mode keeps what an explicit step starts from and works the rest out again: that is less work than to store
     and load all that the step computes on its way. A step that solves equations keeps its solution.
     """
+    if not callable(step):
+        raise ValueError(
+            f"step must be a function (f, t, y, dt, args) -> y, got {step!r}; pass, say, jeuler.euler_step"
+        )
     if not compensated:
 
         def plain(f, t, y_and_lost, dt, args):

@@ -10,7 +10,7 @@ from jeuler import scenes
 
 
 def main() -> None:
-    if len(sys.argv) < 2:
+    if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
         sys.exit(f"{__doc__}\nNAME is one of {', '.join(scene.__name__ for scene in scenes.ALL)}; all without a name")
     matplotlib.use("Agg")
     folder = pathlib.Path(sys.argv[1])
