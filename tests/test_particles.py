@@ -318,6 +318,44 @@ def test_bad_scenes_and_states(forces, state, message):
 
 
 @pytest.mark.parametrize(
+    ("forces", "effects", "message"),
+    [
+        ((jeuler.Gravity,), (), r"got the class Gravity; make one, Gravity\(\.\.\.\)"),
+        ((None,), (), r"Scene.forces must hold functions .* got None"),
+        ((jeuler.Lifetime(1.0),), (), r"Lifetime is an effect.*Scene.effects"),
+        ((), (jeuler.Gravity([0.0, 1.0]),), r"Gravity is a force.*Scene.forces"),
+        ((lambda dt, state: state,), (), r"<lambda> is an effect"),
+    ],
+)
+def test_bad_parts_of_a_scene(forces, effects, message):
+    with pytest.raises(ValueError, match=message):
+        jeuler.Scene(forces, effects)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scene": jeuler.Gravity([0.0, 1.0])}, "scene must be a Scene, got Gravity"),
+        ({"state": {"position": 1.0}}, "state must be a ParticleState, got {'position': 1.0}"),
+        ({"key": 0}, r"key must be a jax.random.key, got 0; pass key=jax.random.key\(0\)"),
+        ({"step": "euler"}, "step must be a function .* got 'euler'; pass, say, jeuler.euler_step"),
+        ({"step": jeuler.implicit_euler}, r"step must be a function .* got implicit_euler\(.*implicit_euler\(\) makes"),
+    ],
+)
+def test_bad_arguments_of_simulate(change, message):
+    arguments = {"scene": jeuler.Scene(), "state": state_with(), "dt": 0.1, "num_steps": 1} | change
+    with pytest.raises(ValueError, match=message):
+        jeuler.simulate(**arguments)
+
+
+def test_words_for_numbers():
+    with pytest.raises(ValueError, match=r"ParticleState.mass must be an array of numbers, got 'heavy'"):
+        state_with(mass="heavy")
+    with pytest.raises(ValueError, match=r"Springs.ks must be a number, .* got None"):
+        jeuler.Springs([[0, 1]], ks=None, kd=0.0, rest_length=1.0)
+
+
+@pytest.mark.parametrize(
     ("edges", "message"),
     [
         ([[0, 0]], r"two different particles, got edges\[0\] = \[0, 0\]"),

@@ -292,3 +292,8 @@ def test_nothing_is_mutated():
 def test_name_of_a_step_is_not_a_step():
     with pytest.raises(ValueError, match="step must be a function .* got 'euler'"):
         jeuler.solve(lambda t, y, args: -y, 1.0, dt=0.1, num_steps=2, step="euler")
+
+
+def test_a_field_without_args():
+    with pytest.raises(ValueError, match=r"f must be a function \(t, y, args\) -> dy/dt, got <lambda>\(t, y\)"):
+        jeuler.solve(lambda t, y: -y, 1.0, dt=0.1, num_steps=2)

@@ -5,6 +5,7 @@ Values that are being traced cannot be looked at, so value checks pass over them
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 from typing import Any
@@ -102,6 +103,42 @@ def count(name: str, x: Any, *, least: int = 0) -> int:
     if n < least:
         raise ValueError(f"{name} must be at least {least}, got {n}")
     return n
+
+
+def kind(name: str, x: Any, expected: type) -> None:
+    """x is one of the expected class."""
+    if not isinstance(x, expected):
+        raise ValueError(f"{name} must be a {expected.__name__}, got {x!r}")
+
+
+def function(name: str, f: Any, form: str, hint: str) -> None:
+    """f can be called with the arguments of the form, such as "(t, y, args) -> dy/dt"."""
+    if not callable(f):
+        raise ValueError(f"{name} must be a function {form}, got {f!r}; {hint}")
+    signature = signature_of(f)
+    try:
+        if signature:
+            signature.bind(*form.split("->")[0].split(","))
+    except TypeError:
+        raise ValueError(
+            f"{name} must be a function {form}, got {getattr(f, '__name__', repr(f))}{signature}; {hint}"
+        ) from None
+
+
+def signature_of(f: Any) -> inspect.Signature | None:
+    """The arguments of f; None for what does not say, such as some functions built into Python."""
+    try:
+        return inspect.signature(f)
+    except (TypeError, ValueError):
+        return None
+
+
+def random_key(key: Any) -> None:
+    """key is None or a key of ``jax.random``, of the new kind or an array of unsigned integers."""
+    dtype = getattr(key, "dtype", None)
+    if key is None or (dtype is not None and (jnp.issubdtype(dtype, jax.dtypes.prng_key) or dtype == jnp.uint32)):
+        return
+    raise ValueError(f"key must be a jax.random.key, got {key!r}; pass key=jax.random.key(0)")
 
 
 def path_name(path: tuple) -> str:

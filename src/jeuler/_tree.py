@@ -63,10 +63,13 @@ def as_float(x: ArrayLike | None) -> Array | None:
 
 
 def store_as_float(component: Any, *names: str) -> None:
-    """For ``__post_init__``: replace the named fields by floating arrays."""
+    """For ``__post_init__``: replace the named fields by floating arrays. None stays where it is the default."""
+    required = {field.name for field in dataclasses.fields(component) if field.default is dataclasses.MISSING}
     for name in names:
         value = getattr(component, name)
         try:
+            if value is None and name in required:
+                raise TypeError
             value = as_float(value)
         except (TypeError, ValueError):
             where = f"{type(component).__name__}.{name}"

@@ -15,7 +15,7 @@ from jeuler._components import by_component, split, stack
 from jeuler.declare import completed, declared, name_of
 from jeuler.forces.fields import per_particle
 from jeuler.methods import Step, euler_step
-from jeuler.solve import Checkpoint, Grid, Solution, advance_by, march, no_loss, solve_reversibly
+from jeuler.solve import Checkpoint, Grid, Solution, advance_by, check_step, march, no_loss, solve_reversibly
 from jeuler.state import ParticleState, parked
 from jeuler.window import in_windows
 
@@ -52,6 +52,8 @@ class Scene:
             parts = getattr(self, name)
             if not isinstance(parts, (tuple, list)):
                 raise ValueError(f"Scene.{name} must be a tuple, got {type(parts).__name__}; write ({name[:-1]},)")
+            for part in parts:
+                _check_part(name, part)
             object.__setattr__(self, name, tuple(_tree.as_component(part) for part in parts))
 
     def vector_field(self, t: Any, y: tuple[Array, Array], mass: Any) -> tuple[Array, Array]:
@@ -188,6 +190,10 @@ def simulate(
 
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
+    _check.kind("scene", scene, Scene)
+    _check.kind("state", state, ParticleState)
+    _check.random_key(key)
+    check_step(step)
     state.check()
     state = completed(state, scene.forces, scene.effects)
     scene.check(state)
@@ -276,6 +282,19 @@ def joined(parts: tuple[tuple, ParticleState]) -> ParticleState:
     """The state of these parts."""
     (position, velocity), rest = parts
     return _tree.replace(rest, position=stack(position), velocity=stack(velocity))
+
+
+def _check_part(name: str, part: Any) -> None:
+    """One ValueError if this cannot be one of Scene.forces or Scene.effects; which it is, its arguments say."""
+    if isinstance(part, type) or not callable(part):
+        what = f"the class {part.__name__}; make one, {part.__name__}(...)" if isinstance(part, type) else repr(part)
+        raise ValueError(f"Scene.{name} must hold functions such as Gravity(...) or Lifetime(...), got {what}")
+    signature = _check.signature_of(part)
+    arguments = set(signature.parameters) if signature else set()
+    if name == "forces" and {"dt", "state"} <= arguments:
+        raise ValueError(f"{name_of(part)} is an effect, (t, dt, state, key) -> state; put it in Scene.effects")
+    if name == "effects" and {"position", "velocity"} <= arguments:
+        raise ValueError(f"{name_of(part)} is a force, (t, position, velocity, mass) -> N; put it in Scene.forces")
 
 
 def _check_effects(scene: Scene, state: ParticleState, grid: Grid, key: Array | None) -> None:

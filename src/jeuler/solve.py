@@ -94,6 +94,7 @@ def solve(
     """
     y0 = _check.state("y0", y0)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=_tree.time_dtype(y0))
+    _check.function("f", f, "(t, y, args) -> dy/dt", "args is there even if f does not need it")
     _check.same_form("the vector field f", y0, jax.eval_shape(f, grid.t0, y0, args))
     if checkpoint == "reversible":
         return solve_reversibly(f, y0, args, grid, save, step, compensated)
@@ -226,16 +227,19 @@ def no_loss(y: PyTree, compensated: bool) -> PyTree:
     return jax.tree.map(jnp.zeros_like, y) if compensated else None
 
 
+def check_step(step: Any) -> None:
+    """One ValueError if step is not a step, but a name or a factory of steps."""
+    hint = "pass, say, jeuler.euler_step, or what jeuler.implicit_euler() makes"
+    _check.function("step", step, "(f, t, y, dt, args) -> y", hint)
+
+
 def advance_by(step: Any, *, compensated: bool) -> Callable:
     """The step on the pair (y, what rounding has cut off y so far; None in plain sums).
 
     Reverse mode keeps what an explicit step starts from and works the rest out again: that is less work than to store
     and load all that the step computes on its way. A step that solves equations keeps its solution.
     """
-    if not callable(step):
-        raise ValueError(
-            f"step must be a function (f, t, y, dt, args) -> y, got {step!r}; pass, say, jeuler.euler_step"
-        )
+    check_step(step)
     if not compensated:
 
         def plain(f, t, y_and_lost, dt, args):

@@ -81,7 +81,10 @@ class ParticleState:
                 value = value and {name: jnp.asarray(x) for name, x in value.items()}
                 object.__setattr__(self, "extra", value or None)
             elif value is not None and not isinstance(value, jax.Array):
-                object.__setattr__(self, field.name, jnp.asarray(value))
+                try:
+                    object.__setattr__(self, field.name, jnp.asarray(value))
+                except (TypeError, ValueError):
+                    raise ValueError(f"ParticleState.{field.name} must be an array of numbers, got {value!r}") from None
         if isinstance(self.mass, jax.Array) and jnp.issubdtype(self.mass.dtype, jnp.integer):
             _tree.store_as_float(self, "mass")
 
