@@ -3,8 +3,9 @@
 from jeuler.effects.appearance import OverLife, SpeedLimit
 from jeuler.effects.collisions import Collisions
 from jeuler.effects.lifecycle import Death, DeathOnContact, DeathOutside, Emitter, Lifetime
+from jeuler.effects.places import Cone, FromDisc, FromLine, FromSphere, FromSurface
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
-from jeuler.effects.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
+from jeuler.effects.samplers import Choice, Normal, Uniform
 
 __all__ = [
     "Choice",
