@@ -10,6 +10,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+from arguments import arguments
 
 import jeuler
 
@@ -74,6 +75,7 @@ def costs():
 
 
 def main():
+    arguments(__doc__)
     jax.config.update("jax_enable_x64", True)
     for particles, dim in ((5, 2), (12, 3)):
         total = dict.fromkeys(STEPS, 0.0)

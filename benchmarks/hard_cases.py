@@ -10,6 +10,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+from arguments import arguments
 
 import jeuler
 from jeuler.colliders import Plane
@@ -79,6 +80,7 @@ def bounce_gradients(dt=1e-3):
 
 
 def main():
+    arguments(__doc__)
     import matplotlib
 
     matplotlib.use("Agg")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from arguments import arguments
 from works import DT, KS, cloth
 
 import jeuler
@@ -37,4 +38,5 @@ def table(steps: tuple[int, ...] = (64, 256, 1024, 4096)) -> str:
 
 
 if __name__ == "__main__":
+    arguments(__doc__)
     print(table())

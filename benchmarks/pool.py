@@ -16,6 +16,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+from arguments import arguments
 
 from jeuler import Gravity, ParticleState, Scene, simulate, symplectic_euler_step, uses
 from jeuler.effects import Cone, Emitter, FromDisc, Lifetime, OverLife, Uniform
@@ -84,6 +85,7 @@ def program(scene, state, *, save_every=25, windows=()):
 
 
 def main() -> None:
+    arguments(__doc__)
     full = pool(200_000)
     programs = {
         "5,000 particles, no pool": program(*plain()),

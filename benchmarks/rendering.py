@@ -7,13 +7,13 @@ import os
 import pathlib
 import platform
 import shutil
-import sys
 import tempfile
 import time
 
 import jax
 import matplotlib
 import numpy as np
+from arguments import arguments
 
 matplotlib.use("Agg")
 
@@ -45,7 +45,7 @@ def swirl(dim: int) -> Solution:
 
 
 def main() -> None:
-    folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
+    folder = pathlib.Path(arguments(__doc__, folder=None).folder or tempfile.mkdtemp())
     endings = ["gif", "html", *(["mp4"] if shutil.which("ffmpeg") else [])]
     print(f"{platform.machine()}, {os.cpu_count()} CPUs, matplotlib {matplotlib.__version__}, jax {jax.__version__}")
     print(f"{PARTICLES} particles, {FRAMES} frames\n\n| film | s | MB |\n|---|--:|--:|")

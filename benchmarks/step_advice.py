@@ -17,6 +17,7 @@ import time
 
 import jax
 import numpy as np
+from arguments import REQUIRED, arguments
 
 import jeuler
 from jeuler.accuracy.pilot import Pilot, distance
@@ -97,4 +98,5 @@ def main(path, part=""):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    given = arguments(__doc__, path=REQUIRED, part="")
+    main(given.path, given.part)
