@@ -297,6 +297,10 @@ def test_bad_arguments_get_one_clear_error():
         Emitter(1.0, **POINT, bursts=((0.0, -3),))
     with pytest.raises(ValueError, match=r"Emitter.max_births must be at least 1"):
         Emitter(1.0, **POINT, max_births=0)
+    with pytest.raises(ValueError, match=r"Emitter.velocity must be a sampler .* the class Cone; make one, Cone"):
+        Emitter(1.0, position=[0.0, 0.0], velocity=Cone)
+    with pytest.raises(ValueError, match=r"Emitter.size must be a function \(key, count\) -> .* got <lambda>\(key\)"):
+        Emitter(1.0, **POINT, size=lambda key: 1.0)
     with pytest.raises(ValueError, match=r"Lifetime.duration must be greater than 0 s"):
         Lifetime(0.0)
     with pytest.raises(ValueError, match=r"OverLife.times must increase"):

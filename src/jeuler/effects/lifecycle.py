@@ -85,9 +85,10 @@ class Emitter:
         object.__setattr__(self, "bursts", bursts)
         _tree.store_as_float(self, "rate", "start", "stop")
         for name in ("position", "velocity", *_OPTIONAL):
-            object.__setattr__(self, name, as_sampler(getattr(self, name)))
+            object.__setattr__(self, name, as_sampler(f"Emitter.{name}", getattr(self, name)))
         if self.extra is not None:
-            object.__setattr__(self, "extra", {name: as_sampler(x) for name, x in self.extra.items()})
+            extra = {name: as_sampler(f"Emitter.extra[{name!r}]", x) for name, x in self.extra.items()}
+            object.__setattr__(self, "extra", extra)
 
     @property
     def samplers(self) -> dict[str, Any]:

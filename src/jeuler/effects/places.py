@@ -202,7 +202,7 @@ class Cone(Sampler):
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "direction", "angle")
-        object.__setattr__(self, "speed", as_sampler(self.speed))
+        object.__setattr__(self, "speed", as_sampler("Cone.speed", self.speed))
 
     @property
     def numbers(self) -> int | None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _random, _tree
+from jeuler import _check, _random, _tree
 
 
 class Sampler:
@@ -59,8 +59,13 @@ def draw_named(samplers: dict[str, Any], key: Array, count: int, dtype: Any) -> 
     return values
 
 
-def as_sampler(x: Any) -> Any:
+def as_sampler(name: str, x: Any) -> Any:
     """A sampler as a pytree of floating arrays; numbers and arrays become arrays, None stays."""
+    if isinstance(x, type):
+        kind = x.__name__
+        raise ValueError(f"{name} must be a sampler or a value, got the class {kind}; make one, {kind}(...)")
+    if callable(x):
+        _check.function(name, x, "(key, count) -> (count, ...)", "a sampler draws all newborns at once")
     return _tree.as_component(x) if callable(x) else _tree.as_float(x)
 
 
