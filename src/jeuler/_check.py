@@ -65,6 +65,13 @@ def shape(name: str, came: tuple[int, ...], *expected: tuple[int, ...], meaning:
         raise ValueError(f"{name} must have shape {what}, got {came}")
 
 
+def indices(name: str, came: Any, count: int, kind: str = "indices") -> None:
+    """Each of the indices is that of one of ``count`` things."""
+    came = np.asarray(came)
+    if came.size and not 0 <= came.min() <= came.max() < count:
+        raise ValueError(f"{name} must be {kind} from 0 to {count - 1}, got from {came.min()} to {came.max()}")
+
+
 def increasing(name: str, times: Any) -> None:
     """Each of the times is later than the one before. Traced times are passed over."""
     if is_traced(times):
@@ -103,6 +110,12 @@ def count(name: str, x: Any, *, least: int = 0) -> int:
     if n < least:
         raise ValueError(f"{name} must be at least {least}, got {n}")
     return n
+
+
+def made(expected: str, x: Any) -> None:
+    """x is a thing, not the class of such things; ``expected`` begins the message."""
+    if isinstance(x, type):
+        raise ValueError(f"{expected}, got the class {x.__name__}; make one, {x.__name__}(...)")
 
 
 def kind(name: str, x: Any, expected: type) -> None:

@@ -31,4 +31,3 @@ def uniform_rows(key: Array, rows: list[int], count: int, dtype: Any) -> Array:
     # the leading bits become the fraction of a number in [1, 2)
     one = np.ones((), dtype).view(bits.dtype)
     return lax.bitcast_convert_type(bits >> (kind.bits - kind.nmant) | one, kind.dtype) - 1
-

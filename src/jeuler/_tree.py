@@ -29,7 +29,7 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
 
     def decorate(cls: type[T]) -> type[T]:
         cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-        names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]
+        names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]  # made one above
         children = tuple(name for name in names if name not in static)
         keys = tuple(jax.tree_util.GetAttrKey(name) for name in children)
 
@@ -89,7 +89,7 @@ class Function:
 
 def replace(component: T, **changes: Any) -> T:
     """The component with some fields changed; ``dataclasses.replace``, as type checkers understand it."""
-    return dataclasses.replace(component, **changes)  # type: ignore[type-var]
+    return dataclasses.replace(component, **changes)  # type: ignore[type-var]  # components are
 
 
 def as_component(x: Any) -> Any:

@@ -6,16 +6,18 @@ import jax.numpy as jnp
 from jax import Array
 
 
-def direction(d: Array) -> tuple[Array, Array]:
-    """Length r and unit vector u = d / r along the last axis; both, and all their derivatives, are 0 at r = 0.
+def apart(square: Array) -> Array:
+    """Whether ends at this squared distance count as apart, not coincident: from tiny^(1/3) on, 2e-13 in float32 and
+    3e-103 in float64. Below that, the second derivative of r overflows."""
+    return square > jnp.finfo(square.dtype).tiny ** (2 / 3)
 
-    Ends closer than tiny^(1/3) (2e-13 in float32, 3e-103 in float64) count as coincident: below that, the second
-    derivative of r overflows.
-    """
+
+def direction(d: Array) -> tuple[Array, Array]:
+    """Length r and unit vector u = d / r along the last axis; both, with all derivatives, are 0 where ends coincide."""
     square = jnp.sum(d * d, axis=-1, keepdims=True)
-    apart = square > jnp.finfo(d.dtype).tiny ** (2 / 3)
-    r = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1)), 0)
-    return r, jnp.where(apart, d / jnp.where(apart, r, 1), 0)
+    not_0 = apart(square)
+    r = jnp.where(not_0, jnp.sqrt(jnp.where(not_0, square, 1)), 0)
+    return r, jnp.where(not_0, d / jnp.where(not_0, r, 1), 0)
 
 
 def length(x: Array) -> Array:

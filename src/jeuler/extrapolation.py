@@ -148,7 +148,8 @@ def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> Extrapolat
         raise ValueError(
             f"order must be at most 12, got {order}; above, its weights amplify roundoff: take a smaller dt"
         )
-    if getattr(step, "order", 1) != 1:
+    step_order = getattr(step, "order", 1)
+    if step_order != 1:
         name = getattr(step, "__name__", repr(step))
-        raise ValueError(f"step must be of order 1, such as euler_step, got {name} of order {step.order}")  # type: ignore[attr-defined]
+        raise ValueError(f"step must be of order 1, such as euler_step, got {name} of order {step_order}")
     return ExtrapolatedStep(order, step)

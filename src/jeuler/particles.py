@@ -286,9 +286,10 @@ def joined(parts: tuple[tuple, ParticleState]) -> ParticleState:
 
 def _check_part(name: str, part: Any) -> None:
     """One ValueError if this cannot be one of Scene.forces or Scene.effects; which it is, its arguments say."""
-    if isinstance(part, type) or not callable(part):
-        what = f"the class {part.__name__}; make one, {part.__name__}(...)" if isinstance(part, type) else repr(part)
-        raise ValueError(f"Scene.{name} must hold functions such as Gravity(...) or Lifetime(...), got {what}")
+    expected = f"Scene.{name} must hold functions such as Gravity(...) or Lifetime(...)"
+    _check.made(expected, part)
+    if not callable(part):
+        raise ValueError(f"{expected}, got {part!r}")
     signature = _check.signature_of(part)
     arguments = set(signature.parameters) if signature else set()
     if name == "forces" and {"dt", "state"} <= arguments:

@@ -141,8 +141,8 @@ class ParticleState:
     def _check_fields(self, particles: int) -> None:
         for name in self.fields():
             shape = getattr(self, name).shape
-            if name in DEFAULTS and shape != (particles, *DEFAULTS[name][0]):
-                raise ValueError(f"state.{name} must have shape {(particles, *DEFAULTS[name][0])}, got {shape}")
+            if name in DEFAULTS:
+                _check.shape(f"state.{name}", shape, (particles, *DEFAULTS[name][0]))
             if name in (self.extra or {}) and shape[:1] not in ((), (particles,)):
                 raise ValueError(f"state.{name} must have shape () or ({particles}, ...), one a particle, got {shape}")
         if self.alive is not None and self.alive.dtype != bool:

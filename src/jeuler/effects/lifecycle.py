@@ -294,8 +294,7 @@ class DeathOutside:
 
     def check(self, particles: int, dim: int) -> None:
         for name in ("low", "high"):
-            if getattr(self, name).shape not in ((), (dim,)):
-                raise ValueError(f"DeathOutside.{name} must have shape () or ({dim},), got {getattr(self, name).shape}")
+            _check.shape(f"DeathOutside.{name}", getattr(self, name).shape, (), (dim,))
 
 
 @_tree.component()

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler._vectors import direction
 from jeuler.effects.samplers import Sampler, as_sampler, numbers_of, standard_normal
 
@@ -71,7 +71,7 @@ class FromDisc(Sampler):
 
     center: Array
     radius: Array
-    normal: Array = (0.0, 0.0, 1.0)  # type: ignore[assignment]
+    normal: _tree.Parameter = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "center", "radius", "normal")
@@ -151,13 +151,9 @@ class FromSurface(Sampler):
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "vertices")
         faces = np.asarray(self.faces)
-        if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        if faces.shape[1:] != (3,) or not faces.size or not np.issubdtype(faces.dtype, np.integer):
             raise ValueError(f"FromSurface.faces must be integers of shape (face, 3), got {faces.dtype} {faces.shape}")
-        if faces.min() < 0 or faces.max() >= len(self.vertices):
-            raise ValueError(
-                f"FromSurface.faces must be indices from 0 to {len(self.vertices) - 1}, "
-                f"got from {faces.min()} to {faces.max()}"
-            )
+        _check.indices("FromSurface.faces", faces, len(self.vertices))
         object.__setattr__(self, "faces", tuple(map(tuple, faces.tolist())))
 
     numbers = 3
@@ -198,7 +194,7 @@ class Cone(Sampler):
 
     direction: Array
     speed: Any
-    angle: Array = 0.0  # type: ignore[assignment]
+    angle: _tree.Parameter = 0.0
 
     def __post_init__(self) -> None:
         _tree.store_as_float(self, "direction", "angle")

@@ -22,9 +22,7 @@ class Sampler:
     """What the samplers share: ``at(u)``, a smooth function of uniform numbers u, (numbers, count), in [0, 1)."""
 
     numbers: Any  # that a particle takes; None where a function of the person's own draws them from a key
-
-    def at(self, u: Array) -> Array:
-        raise NotImplementedError
+    at: Any
 
     def __call__(self, key: Array, count: int) -> Array:
         return self.at(jax.random.uniform(key, (self.numbers, count), jnp.result_type(*jax.tree.leaves(self))))
@@ -61,12 +59,11 @@ def draw_named(samplers: dict[str, Any], key: Array, count: int, dtype: Any) -> 
 
 def as_sampler(name: str, x: Any) -> Any:
     """A sampler as a pytree of floating arrays; numbers and arrays become arrays, None stays."""
-    if isinstance(x, type):
-        kind = x.__name__
-        raise ValueError(f"{name} must be a sampler or a value, got the class {kind}; make one, {kind}(...)")
-    if callable(x):
-        _check.function(name, x, "(key, count) -> (count, ...)", "a sampler draws all newborns at once")
-    return _tree.as_component(x) if callable(x) else _tree.as_float(x)
+    _check.made(f"{name} must be a sampler or a value", x)
+    if not callable(x):
+        return _tree.as_float(x)
+    _check.function(name, x, "(key, count) -> (count, ...)", "a sampler draws all newborns at once")
+    return _tree.as_component(x)
 
 
 @_tree.component()

@@ -212,7 +212,7 @@ class Vortex:
     center: Any
     circulation: Array
     core: Array
-    axis: Array = (0.0, 0.0, 1.0)  # type: ignore[assignment]
+    axis: _tree.Parameter = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving(self.center))

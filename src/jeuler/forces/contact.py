@@ -39,8 +39,8 @@ class PenaltyContact:
 
     collider: Any
     ks: Array
-    kd: Array = 0.0  # type: ignore[assignment]
-    radius: Array = 0.0  # type: ignore[assignment]
+    kd: _tree.Parameter = 0.0
+    radius: _tree.Parameter = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "collider", _tree.as_component(self.collider))

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _tree
+from jeuler import _check, _tree
 from jeuler._components import by_component, split, stack
 from jeuler.forces.air import air_velocity, as_air, check_air
 
@@ -126,7 +126,4 @@ class QuadraticDrag:
 
 
 def check_coefficient(name: str, coefficient: Array, particles: int) -> None:
-    if coefficient.shape not in ((), (particles,)):
-        raise ValueError(
-            f"{name}.coefficient must have shape () or ({particles},), one a particle, got {coefficient.shape}"
-        )
+    _check.shape(f"{name}.coefficient", coefficient.shape, (), (particles,), meaning="one a particle")

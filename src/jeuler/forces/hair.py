@@ -14,7 +14,7 @@ from jax import Array, lax
 
 from jeuler import _check, _tree
 from jeuler._vectors import direction
-from jeuler.forces.topology import Indices, check_indices
+from jeuler.forces.topology import Indices
 
 
 def strand_edges(strands: Any) -> np.ndarray:
@@ -100,7 +100,7 @@ class _OnStrands:
         return _tree.replace(self, here=here.astype(self.rest_position.dtype))
 
     def check(self, particles: int, dim: int) -> None:
-        check_indices(f"{type(self).__name__}.strands", self.strands, particles)
+        _check.indices(f"{type(self).__name__}.strands", self.strands, particles, "particle indices")
         if dim != 3:
             raise ValueError(f"{type(self).__name__} needs particles in space, dim 3, got dim {dim}")
 

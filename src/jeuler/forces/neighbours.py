@@ -10,7 +10,7 @@ from jax import Array
 
 from jeuler import _check, _tree
 from jeuler._vectors import direction
-from jeuler.forces.topology import Indices, Topology, check_indices
+from jeuler.forces.topology import Indices, Topology
 
 
 @_tree.component(static=("edges",))
@@ -90,7 +90,7 @@ class Bending:
 
     triples: Any
     stiffness: Array
-    rest_angle: Array = 0.0  # type: ignore[assignment]
+    rest_angle: _tree.Parameter = 0.0
 
     def __post_init__(self) -> None:
         triples = np.asarray(self.triples)
@@ -129,7 +129,7 @@ class Bending:
         return _tree.replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
 
     def check(self, particles: int, dim: int) -> None:
-        check_indices("Bending.triples", self.triples, particles)
+        _check.indices("Bending.triples", self.triples, particles, "particle indices")
         for name in ("stiffness", "rest_angle"):
             shape = getattr(self, name).shape
             _check.shape(f"Bending.{name}", shape, (), (len(self.triples),), meaning="one a triple")

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from jeuler import _check, _tree
-from jeuler.forces.topology import Indices, check_indices
+from jeuler.forces.topology import Indices
 
 
 @jax.custom_jvp
@@ -72,7 +72,7 @@ class ShapeMatching:
     particles: Any
     rest_position: Array
     stiffness: Array
-    damping: Array = 0.0  # type: ignore[assignment]
+    damping: _tree.Parameter = 0.0
     here: Array | None = None
 
     def __post_init__(self) -> None:
@@ -103,5 +103,5 @@ class ShapeMatching:
         return _tree.replace(self, here=alive[np.asarray(self.particles)].astype(self.rest_position.dtype))
 
     def check(self, particles: int, dim: int) -> None:
-        check_indices("ShapeMatching.particles", self.particles, particles)
+        _check.indices("ShapeMatching.particles", self.particles, particles, "particle indices")
         _check.shape("ShapeMatching.rest_position", self.rest_position.shape, (len(self.particles), dim))

@@ -11,7 +11,7 @@ from jax import Array
 
 from jeuler import _check, _tree
 from jeuler._components import split, stack
-from jeuler._vectors import direction
+from jeuler._vectors import apart, direction
 from jeuler.forces.incidence import stored
 from jeuler.forces.layouts import Layout
 from jeuler.forces.topology import Topology
@@ -19,8 +19,8 @@ from jeuler.forces.topology import Topology
 
 @jax.custom_jvp
 def length(square: Array) -> Array:
-    """r from r^2; 0, and all derivatives 0, where the ends coincide (see `direction`). dr = d(r^2) / 2r."""
-    return jnp.sqrt(jnp.where(square > jnp.finfo(square.dtype).tiny ** (2 / 3), square, 0))
+    """r from r^2; 0, and all derivatives 0, where the ends coincide (see `apart`). dr = d(r^2) / 2r."""
+    return jnp.sqrt(jnp.where(apart(square), square, 0))
 
 
 @length.defjvp
@@ -42,14 +42,14 @@ def spring_force(
 
         F = c d,   c = (ks L - kd v.u) / r - ks,   u = d / r
 
-    At r = 0, c is the number -ks with all its derivatives 0 (see `direction`), so that for L = 0 the Jacobian
+    At r = 0, c is the number -ks with all its derivatives 0 (see `apart`), so that for L = 0 the Jacobian
     there is -ks I. One number c a spring, stored: the components of F, at either end, are products with it.
     """
     r = length(dot(d, d))
-    apart = r > 0
-    divisor = jnp.where(apart, r, 1)
+    long = r > 0
+    divisor = jnp.where(long, r, 1)
     approach = dot(relative_velocity, d) / divisor
-    c = stored(jnp.where(apart, ks * rest_length - kd * approach, 0) / divisor - ks)
+    c = stored(jnp.where(long, ks * rest_length - kd * approach, 0) / divisor - ks)
     return [c * component for component in d]
 
 

@@ -49,15 +49,6 @@ class Indices:
         return f"{type(self).__name__}(shape={self.shape})"
 
 
-def check_indices(name: str, indices: Any, particles: int) -> None:
-    """Every index is that of a particle."""
-    indices = np.asarray(indices)
-    if indices.size and not 0 <= indices.min() <= indices.max() < particles:
-        raise ValueError(
-            f"{name} must be particle indices from 0 to {particles - 1}, got from {indices.min()} to {indices.max()}"
-        )
-
-
 class Topology(Indices):
     """The edges of a scene, (spring, 2).
 
