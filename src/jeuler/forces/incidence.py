@@ -17,29 +17,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import lax
 from jax.interpreters import ad, batching, mlir
 
-Primitive: Any = type(lax.add_p)  # jax.extend.core.Primitive; that module would import Pallas too
-
-stored_p = Primitive("stored")
-
-
-def stored(x: Array) -> Array:
-    """x and its cotangent, each worked out once and stored, not again for each of its uses.
-
-    XLA on CPU fuses what it thinks cheap into every consumer: what a spring gives to its two ends, a dozen
-    operations, would be done twice, once for either end. A division it never repeats. This is one, by a number
-    that is 1 but not a constant to XLA; LLVM, which comes after, knows that no float is greater than inf and
-    drops the division.
-    """
-    return stored_p.bind(x)
-
-
-def as_stored(x):
-    """The arithmetic of `stored`, for use inside the two maps."""
-    return x / jnp.where(x > jnp.inf, 2, 1).astype(x.dtype)
-
+from jeuler.forces.hints import Primitive, stored
 
 difference_p = Primitive("difference")
 difference_p.multiple_results = True
@@ -120,12 +101,6 @@ def _accumulate_batch(operands, axes, *, layout):
     slots = [_batch_first(x, axis, sizes[0]) for x, axis in zip(operands[:groups], axes[:groups], strict=True)]
     return accumulate_p.bind(*slots, *tables, layout=layout), 0
 
-
-stored_p.def_impl(lambda x: x)
-stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
-mlir.register_lowering(stored_p, mlir.lower_fun(as_stored, multiple_results=False))
-ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])
-batching.defvectorized(stored_p)
 
 for primitive, rule, shape in (
     (difference_p, _difference, _difference_shape),
