@@ -224,7 +224,8 @@ def test_a_hub_does_not_pad_the_others():
     rim = np.stack([np.arange(1, 10_000), np.random.default_rng(0).permutation(np.arange(2, 10_001))], axis=1)
     edges = np.concatenate([spokes, rim[rim[:, 0] != rim[:, 1]]])
     (layout,) = Topology(edges).layouts(10_001)
-    assert sum(slots.size for slots in layout.slot_edges) < 1.2 * 2 * len(edges)
+    assert sum(slots.size for slots in layout.slot_edges) < 1.1 * len(edges)
+    assert sum(table.size for table in layout.tables) < 1.1 * 2 * len(edges) + 2 * 10_001
 
 
 @pytest.mark.parametrize("name", ["shifts", "rows"])
