@@ -171,6 +171,7 @@ class Rows(Layout):
         by = np.argsort(other, kind="stable")
         slot = (column * far.shape[1] + row)[by]
         row, column, meets_further = in_rows(other[by], empty + 1, LONGEST_ROW)
+        meets_further = np.append(meets_further, [empty, empty])  # at least two, see _accumulate
         meets = np.full((LONGEST_ROW, empty + 1 + len(meets_further)), empty)
         meets[column, row] = slot
         ends = np.cumsum(sizes)
@@ -178,7 +179,6 @@ class Rows(Layout):
 
         own = np.concatenate([order, order[:1], order[further]])
         more = np.concatenate([further, meets_further])
-        self.hubs = len(more) > 0
         tables = (own, place, far, more, meets[:, empty + 1 :], *met_tables)
         self.tables = tuple(np.ascontiguousarray(table, np.int32) for table in tables)
 
@@ -189,16 +189,16 @@ class Rows(Layout):
 
     def _accumulate(self, slots, *tables):
         _, place, _, more, meets_more, *meets = tables
-        # XLA would fuse what f is made of into its gathers: one more gather for each factor
+        # XLA would fuse what f is made of into its gathers: one more gather for each factor.
         (f,) = map(incidence.as_stored, slots)
         flat = f.reshape(*f.shape[:-2], -1)
         given = sum_of_columns(f)
         met = jnp.concatenate([sum_of_columns(take(flat, table)) for table in meets], axis=-1)
         rows = met.shape[-1]
-        total = given[..., :rows] - met
-        if self.hubs:
-            rest = jnp.concatenate([given[..., rows:], -sum_of_columns(take(flat, meets_more))], axis=-1)
-            total = total.at[..., more].add(rest, mode="promise_in_bounds")
+        rest = jnp.concatenate([given[..., rows:], -sum_of_columns(take(flat, meets_more))], axis=-1)
+        # Few rows, often none but the empty one, twice. Nothing fuses with a scatter of two: this one keeps XLA from
+        # working out all sums inside the last gather, one at a time.
+        total = (given[..., :rows] - met).at[..., more].add(rest, mode="promise_in_bounds")
         return take(total, place)
 
 
