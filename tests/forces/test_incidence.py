@@ -22,7 +22,7 @@ PARTICLES = 30
 
 @pytest.fixture(scope="module", autouse=True)
 def rows_for_small_graphs():
-    """So that graphs of 40 edges get the layout of 8,000."""
+    """So that graphs of 40 edges get the layout of 500."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(topology, "MANY", 40)
         topology._layouts.cache_clear()
