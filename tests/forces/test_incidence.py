@@ -1,6 +1,7 @@
 """The kernels of springs: every layout is the same linear map, with the same derivatives, as the plain
 formula."""
 
+import re
 import subprocess
 import sys
 
@@ -21,7 +22,7 @@ PARTICLES = 30
 
 @pytest.fixture(scope="module", autouse=True)
 def rows_for_small_graphs():
-    """So that graphs of 40 edges get the layout of 8,000."""
+    """So that graphs of 40 edges get the layout of 500."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(topology, "MANY", 40)
         topology._layouts.cache_clear()
@@ -107,7 +108,7 @@ def test_each_layout_is_the_incidence_matrix(name, random, monkeypatch):
     for layout in (kind(edges, np.arange(len(edges)), PARTICLES) for kind in (Rows, Pairs)):
         check_equal(weighted_sum(layout, e, x), b.T @ (e * (b @ x)), 1e-14)
         held = np.concatenate([slots.ravel() for slots in layout.slot_edges])
-        assert (np.bincount(held[held >= 0], minlength=len(edges)) == layout.copies).all()
+        assert (np.bincount(held[held >= 0], minlength=len(edges)) == 1).all()
 
 
 @settings(max_examples=15, deadline=None)
@@ -226,11 +227,12 @@ def test_a_hub_does_not_pad_the_others():
     rim = np.stack([np.arange(1, 10_000), np.random.default_rng(0).permutation(np.arange(2, 10_001))], axis=1)
     edges = np.concatenate([spokes, rim[rim[:, 0] != rim[:, 1]]])
     (layout,) = Topology(edges).layouts(10_001)
-    assert sum(slots.size for slots in layout.slot_edges) < 1.2 * 2 * len(edges)
+    assert sum(slots.size for slots in layout.slot_edges) < 1.1 * len(edges)
+    assert sum(table.size for table in layout.tables) < 1.1 * 2 * len(edges) + 2 * 10_001
 
 
 @pytest.mark.parametrize("name", ["shifts", "rows"])
-def test_the_gradient_does_not_scatter(name):
+def test_the_gradient_scatters_no_edges(name):
     edges, _ = graphs()[name]
     position = jnp.zeros((PARTICLES, 3))
 
@@ -239,8 +241,9 @@ def test_the_gradient_does_not_scatter(name):
         state = jeuler.ParticleState(position, position)
         return jnp.sum(jeuler.simulate(scene, state, dt=0.1, num_steps=4, save_every=4).y.position[-1])
 
-    program = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(position, 1.0).compile().as_text()
-    assert " scatter(" not in program
+    program = jax.jit(jax.grad(loss, argnums=(0, 1))).lower(position, 1.0).as_text()
+    updates = re.findall(r'"stablehlo.scatter".*?\}\) : \([^)]*, tensor<(\d+)x[^)]*\)', program, re.DOTALL)
+    assert sorted(set(updates)) == {"shifts": [], "rows": ["2"]}[name]  # two empty rows, see Rows._accumulate
 
 
 def test_the_program_does_not_grow_with_the_number_of_springs():

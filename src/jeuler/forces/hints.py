@@ -47,12 +47,13 @@ def padded(x: Array, width: int) -> Array:
     return jnp.pad(x - jnp.where(x > jnp.inf, 1, 0).astype(x.dtype), [(0, 0)] * (x.ndim - 1) + [(width, width)])
 
 
-def _as_division(x):
+def as_stored(x: Array) -> Array:
+    """The arithmetic of `stored`, for use inside other primitives."""
     return x / jnp.where(x > jnp.inf, 2, 1).astype(x.dtype)
 
 
 stored_p.def_impl(lambda x: x)
 stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
-mlir.register_lowering(stored_p, mlir.lower_fun(_as_division, multiple_results=False))
+mlir.register_lowering(stored_p, mlir.lower_fun(as_stored, multiple_results=False))
 ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])
 batching.defvectorized(stored_p)

@@ -4,10 +4,9 @@
 
 - `Shifts`: all edges (i, i + k) of one offset k make a group. B subtracts an array from itself shifted by k, B^T adds
   two shifted copies. Slots are contiguous, nothing is looked up. Cloth, ropes, hair, lattices.
-- `Rows`: any graph. Each particle has a row with one slot for each of its edges; both ends hold the edge,
-with
-  opposite signs, so that B^T sums a row and needs no look-up, and B gathers only the far ends.
-- `Pairs`: a few edges, or few thousand. Two gathers and two scatters, as one would write it by hand.
+- `Rows`: any graph. One end owns the edge and has its slot in its row: B gathers the far ends, B^T sums a row and
+  gathers what the other edges of the particle give.
+- `Pairs`: a few edges, or few hundred. Two gathers and two scatters, as one would write it by hand.
 
 Slots may be empty; c is 0 there, or B x is.
 """
@@ -22,7 +21,7 @@ from jax import Array
 
 from jeuler._vectors import dot
 from jeuler.forces import incidence
-from jeuler.forces.hints import kept, stored
+from jeuler.forces.hints import as_stored, kept, stored
 from jeuler.forces.laplacian import laplacian, products
 
 Law = Callable[..., Array]  # (square, approach, *parameters) -> c, elementwise
@@ -32,23 +31,11 @@ class Layout:
     """Where the edges lie in memory. Hashable by identity: layouts are made once a topology and cached.
 
     Attributes:
-      copies: how often each edge is held, 1 or 2.
       slot_edges: one integer array a group: the edge in each slot, -1 for none.
-      tables: the integer and boolean arrays that the two maps look things up in.
     """
 
-    copies: int
     particles: int
     slot_edges: tuple[np.ndarray, ...]
-    tables: tuple[np.ndarray, ...]
-
-    def difference(self, x: Array) -> list[Array]:
-        """B x: (particle,) to one array of slots a group."""
-        return incidence.difference_p.bind(x, *self.tables, layout=self)
-
-    def accumulate(self, slots: Sequence[Array]) -> Array:
-        """B^T f: one array of slots a group to (particle,)."""
-        return incidence.accumulate_p.bind(*slots, *self.tables, layout=self)
 
     def central_force(
         self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
@@ -57,12 +44,7 @@ class Layout:
 
         Parameters are what `to_slots` made of them.
         """
-        d, s = ([self.difference(component) for component in y] for y in (x, v))
-        if self.copies == 1:  # both ends read one slot: stored, its cotangent too, not worked out again for either
-            d = [[stored(slots) for slots in component] for component in d]
-        by_group = zip(zip(*d, strict=True), zip(*s, strict=True), *parameters, strict=True)
-        c = [stored(law(dot(d, d), dot(s, d), *own)) for d, s, *own in by_group]
-        return [self.accumulate([a * b for a, b in zip(c, component, strict=True)]) for component in d]
+        raise NotImplementedError
 
     def to_slots(self, x: Array) -> list[Array] | Array:
         """A value of each edge, () or (edge,), as one array a group with 0 in empty slots, or what `by_group` takes."""
@@ -76,10 +58,35 @@ class Layout:
         assert isinstance(parameter, list)
         return parameter
 
-    def _difference(self, x: Array, *tables: Array) -> list[Array]:
+
+class Looked(Layout):
+    """Edges in one group of slots, whose ends are looked up in tables: B and B^T are primitives of their own.
+
+    Attributes:
+      tables: the integer arrays that B and B^T look things up in.
+    """
+
+    tables: tuple[np.ndarray, ...]
+
+    def central_force(self, law, x, v, parameters):
+        # both ends read one slot: d is stored, its cotangent too, not worked out again for either
+        d = [stored(self.difference(component)) for component in x]
+        s = [self.difference(component) for component in v]
+        c = stored(law(dot(d, d), dot(s, d), *(parameter for (parameter,) in parameters)))
+        return [self.accumulate(c * component) for component in d]
+
+    def difference(self, x: Array) -> Array:
+        """B x: (particle,) to slots."""
+        return incidence.difference_p.bind(x, *self.tables, layout=self)
+
+    def accumulate(self, f: Array) -> Array:
+        """B^T f: slots to (particle,)."""
+        return incidence.accumulate_p.bind(f, *self.tables, layout=self)
+
+    def _difference(self, x: Array, *tables: Array) -> Array:
         raise NotImplementedError
 
-    def _accumulate(self, slots: Sequence[Array], *tables: Array) -> Array:
+    def _accumulate(self, f: Array, *tables: Array) -> Array:
         raise NotImplementedError
 
 
@@ -89,8 +96,6 @@ class Shifts(Layout):
     The two maps and the layout of their slots are those of `jeuler.forces.laplacian`. What is one number for all edges
     is one array for all groups, of the longest one's length: half the memory traffic of cloth.
     """
-
-    copies = 1
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         low, high = edges.min(axis=1), edges.max(axis=1)
@@ -103,7 +108,6 @@ class Shifts(Layout):
             group[high[chosen]] = numbers[chosen]
             groups.append(group)
         self.slot_edges = tuple(groups)
-        self.tables = ()
 
     def central_force(self, law, x, v, parameters):
         x, v = ([kept(component) for component in y] for y in (x, v))
@@ -126,108 +130,104 @@ class Shifts(Layout):
         return [parameter[: self.particles + k] for k in self.offsets]
 
 
-LONGEST_ROW = 32  # a particle with more edges has several rows, so that a hub does not pad all others
-GROUP_COST = 2000  # slots that one more group of rows costs in overhead,
+LONGEST_ROW = 32  # slots that one row looks up; the hub that meets more edges has several rows
+GROUP_COST = 500  # slots that one more group of rows costs in overhead,
 GROUP_SHARE = 1 / 60  # and at least this share of all, so that the program stays short
+MOST_TURNS = 100  # of edges from one owner to the other; a mesh needs 30
+FURTHER_COST = 16  # slots that a further row of a particle costs, as its sum is scattered
 
 
-class Rows(Layout):
-    """Any graph: a row of slots for each particle, both ends of an edge hold it.
+class Rows(Looked):
+    """Any graph: each edge has one slot, in the row of the one end that owns it; the other end looks it up.
 
-        particle 7:  (7, 2) (7, 9) (7, 30)  -        slots of one row: x7 - x2, x7 - x9, x7 - x30, 0
+        row 7 owns    (7, 2) (7, 9) (7, 30)  -       B x:    x7 - x2, x7 - x9, x7 - x30, 0
+        row 7 meets   (4, 7) (11, 7)                 B^T f:  the sum of row 7, minus f in the slots (4, 7) and (11, 7)
 
-    Rows are grouped by length (a few lengths, chosen to waste few slots) and lie as columns, (length, row),
-    so that a loop runs over the rows. Particles are taken in reverse Cuthill-McKee order: far ends lie near
-    in memory. A slot takes one gathered load a component in B and one plain load in B^T; holding both ends
-    doubles the arithmetic and saves the look-ups of B^T, which cost more.
+    Who owns an edge is chosen so that all particles own about as many: a few columns (column, row) then hold nearly
+    all edges, with few empty slots, and loops run over all the rows. Who owns more than there are columns has further
+    rows. The edges that a particle meets are as uneven as its degree: their tables are in groups of like length.
+    Rows go by group, in it in reverse Cuthill-McKee order, and the slots of a row in the order of the far ends: what
+    a column looks up lies near what it looked up before.
 
-    f in both slots of an edge has opposite signs: B x has, and every even function of it times B x. On such f
-    the sum over rows is B^T, the transpose of B for the product over edges, half the sum over slots.
+    An edge takes one gathered load a component in B, one in B^T, each with its index, and no scatter. Held in the rows
+    of both ends, as one might, it takes two in B, none in B^T, but all arithmetic and all plain loads twice: for
+    springs in 3-D 12 gathers instead of 9, and 2 square roots and 4 divisions instead of half; in the gradient 18
+    instead of 15.
     """
-
-    copies = 2
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles
+        owner, other = evenly_owned(edges, particles)
+        owned, met = (np.bincount(ends, minlength=particles) for ends in (owner, other))
+
+        # A row for each particle that has edges, and a last one of empty slots: its sum is that of all who have none,
+        # its slots are read by who meets less edges than its group.
         order = near_order(edges, particles)
-        place = np.empty(particles, np.int32)
-        place[order] = np.arange(particles, dtype=np.int32)
-        near, far = place[edges.ravel()], place[edges[:, ::-1].ravel()]
-        both = np.argsort(near, kind="stable")
-        near, far, number = near[both], far[both], np.repeat(numbers, 2)[both]
-        degree = np.bincount(near, minlength=particles)
-        rank = np.arange(len(near)) - np.repeat(np.cumsum(degree) - degree, degree)
-
-        # Rows: of each particle as many as its degree needs, all but the last one full.
-        rows_of = -(-degree // LONGEST_ROW)
-        owner = np.repeat(np.arange(particles), rows_of)
-        first_row = np.cumsum(rows_of) - rows_of
-        row, column = first_row[near] + rank // LONGEST_ROW, rank % LONGEST_ROW
-        length = np.bincount(row, minlength=len(owner))
-
-        # Groups: rows of like length, in the order of the particles.
+        order = order[(owned + met)[order] > 0]
+        length = np.clip(met[order], 1, LONGEST_ROW)
         widths = group_widths(length)
         group = np.searchsorted(widths, length)
-        sorted_rows = np.argsort(group, kind="stable")
-        place_of_row = np.empty(len(owner), np.int32)
-        place_of_row[sorted_rows] = np.arange(len(owner), dtype=np.int32)
-        self.sizes = tuple(np.bincount(group, minlength=len(widths)).tolist())
-        self.widths = tuple(int(w) for w in widths)
+        order = order[np.argsort(group, kind="stable")]
+        sizes = np.bincount(group)
+        sizes[-1] += 1
+        empty = len(order)
+        place = np.full(particles, empty)
+        place[order] = np.arange(len(order))
 
-        far_tables, slot_edges, start = [], [], 0
-        for width, size in zip(self.widths, self.sizes, strict=True):
-            own = owner[sorted_rows[start : start + size]].astype(np.int32)
-            table = np.tile(own, (width, 1))  # an empty slot holds the difference of a particle to itself
-            edge = np.full((width, size), -1, np.int32)
-            here = (place_of_row[row] >= start) & (place_of_row[row] < start + size)
-            table[column[here], place_of_row[row[here]] - start] = far[here]
-            edge[column[here], place_of_row[row[here]] - start] = number[here]
-            far_tables.append(table)
-            slot_edges.append(edge)
-            start += size
-        self.slot_edges = tuple(slot_edges)
+        # What each row owns.
+        owner, other = place[owner], place[other]
+        by = np.lexsort((other, owner))
+        owner, other, numbers = owner[by], other[by], numbers[by]
+        columns = columns_for(owned[order])
+        row, column, further = in_rows(owner, empty + 1, columns)
+        far = np.tile(np.arange(empty + 1 + len(further)), (columns, 1))  # a particle itself, in an empty slot
+        far[column, row] = other
+        edge = np.full(far.shape, -1, np.int32)
+        edge[column, row] = numbers
+        self.slot_edges = (edge,)
 
-        # Back to particles: the first row of each (or the zero behind all rows), and what further rows of
-        # hubs give.
-        first = np.where(rows_of > 0, place_of_row[np.minimum(first_row, len(owner) - 1)], len(owner))
-        further = np.ones(len(owner), bool)
-        further[first_row[rows_of > 0]] = False
-        self.hubs = bool(further.any())
-        hub_tables = (order[owner[further]], place_of_row[further]) if self.hubs else ()
-        tables = (order, owner[sorted_rows], first[place], *hub_tables, *far_tables)
+        # What each row meets.
+        by = np.argsort(other, kind="stable")
+        slot = (column * far.shape[1] + row)[by]
+        row, column, meets_further = in_rows(other[by], empty + 1, LONGEST_ROW)
+        meets_further = np.append(meets_further, [empty, empty])  # at least two, see _accumulate
+        meets = np.full((LONGEST_ROW, empty + 1 + len(meets_further)), empty)
+        meets[column, row] = slot
+        ends = np.cumsum(sizes)
+        met_tables = [meets[:w, end - size : end] for w, size, end in zip(widths, sizes, ends, strict=True)]
+
+        own = np.concatenate([order, order[:1], order[further]])
+        more = np.concatenate([further, meets_further])
+        tables = (own, place, far, more, meets[:, empty + 1 :], *met_tables)
         self.tables = tuple(np.ascontiguousarray(table, np.int32) for table in tables)
 
     def _difference(self, x, *tables):
-        order, owner, _ = tables[:3]
-        far_tables = tables[5:] if self.hubs else tables[3:]
-        x = take(x, order)
-        own = take(x, owner)
-        slots, start = [], 0
-        for size, far in zip(self.sizes, far_tables, strict=True):
-            slots.append(own[..., None, start : start + size] - take(x, far))
-            start += size
-        return slots
+        own, _, far = tables[:3]
+        x = take(x, own)
+        return x[..., None, :] - take(x, far)
 
-    def _accumulate(self, slots, *tables):
-        first = tables[2]
-        sums = [sum(f[..., m, :] for m in range(f.shape[-2])) for f in slots]
-        rows = jnp.concatenate([*sums, jnp.zeros_like(sums[0][..., :1])], axis=-1)
-        total = take(rows, first)
-        if self.hubs:
-            hub, row = tables[3:5]
-            total = total.at[..., hub].add(take(rows, row), mode="promise_in_bounds")
-        return total
+    def _accumulate(self, f, *tables):
+        _, place, _, more, meets_more, *meets = tables
+        # XLA would fuse what f is made of into its gathers: one more gather for each factor.
+        f = as_stored(f)
+        flat = f.reshape(*f.shape[:-2], -1)
+        given = sum_of_columns(f)
+        met = jnp.concatenate([sum_of_columns(take(flat, table)) for table in meets], axis=-1)
+        rows = met.shape[-1]
+        rest = jnp.concatenate([given[..., rows:], -sum_of_columns(take(flat, meets_more))], axis=-1)
+        # Few rows, often none but the empty one, twice. Nothing fuses with a scatter of two: this one keeps XLA from
+        # working out all sums inside the last gather, one at a time.
+        total = (given[..., :rows] - met).at[..., more].add(rest, mode="promise_in_bounds")
+        return take(total, place)
 
 
-class Pairs(Layout):
-    """Not many edges, as one would write it: a slot an edge, two gathers in B, two scatters in B^T.
+class Pairs(Looked):
+    """Few edges, as one would write it: a slot an edge, two gathers in B, two scatters in B^T.
 
-    As many slots as edges, and no padding. Up to some thousand edges, and in batches of such systems, that beats
-    `Rows`: 866 springs of a mesh take 15 instead of 18 ns each, their gradient 44 instead of 58, and in a batch of 32,
-    13 instead of 48 and 68 instead of 245. From 10,000 edges on the scatters cost more than `Rows`' second copies.
+    As many slots as edges, no padding, and the shortest program. 46 springs take 19 instead of 42 ns each in `Rows`;
+    from 164 on both take the same, and 866 springs take 11 instead of 7 ns in `Rows`, their gradient the same, in a
+    batch of 32 9.1 instead of 8.0 and 46 instead of 40.
     """
-
-    copies = 1
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles
@@ -236,10 +236,10 @@ class Pairs(Layout):
 
     def _difference(self, x, *tables):
         i, j = tables
-        return [take(x, i) - take(x, j)]
+        return take(x, i) - take(x, j)
 
-    def _accumulate(self, slots, *tables):
-        (f,), (i, j) = slots, tables
+    def _accumulate(self, f, *tables):
+        i, j = tables
         total = jnp.zeros((*f.shape[:-1], self.particles), f.dtype)
         total = total.at[..., i].add(f, mode="promise_in_bounds")
         return total.at[..., j].add(-f, mode="promise_in_bounds")
@@ -249,6 +249,49 @@ def take(x: Array, index: Array) -> Array:
     """x at index along its last axis; indices are known to be in range, which spares the program a check of
     each."""
     return x.at[..., index].get(mode="promise_in_bounds")
+
+
+def sum_of_columns(x: Array) -> Array:
+    """The sum of each row, x being (..., column, row)."""
+    return sum(x[..., column, :] for column in range(x.shape[-2]))  # type: ignore[return-value]
+
+
+def evenly_owned(edges: np.ndarray, particles: int) -> tuple[np.ndarray, np.ndarray]:
+    """The edges as (owner, other), such that particles own about equally many.
+
+    At first the end with less edges owns; then edges turn round, all at once but for one in and one out of a particle,
+    while that takes from one who owns at least two more. The sum of squares falls each time.
+    """
+    degree = np.bincount(edges.ravel(), minlength=particles)
+    turned = degree[edges[:, 0]] > degree[edges[:, 1]]
+    owner, other = np.where(turned, edges[:, ::-1].T, edges.T)
+    for _ in range(MOST_TURNS):
+        owned = np.bincount(owner, minlength=particles)
+        turn = np.flatnonzero(owned[owner] > owned[other] + 1)
+        for end in (owner, other):
+            turn = turn[np.unique(end[turn], return_index=True)[1]]
+        if not len(turn):
+            break
+        owner[turn], other[turn] = other[turn], owner[turn]
+    return owner, other
+
+
+def in_rows(key: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Items sorted by key, the first of key k in row k, others in rows from ``rows`` on: row and column of each item,
+    and the keys of the further rows."""
+    count = np.bincount(key, minlength=rows)
+    rank = np.arange(len(key)) - np.repeat(np.cumsum(count) - count, count)
+    more = np.maximum(-(-count // columns) - 1, 0)
+    start = rows + np.cumsum(more) - more
+    row = np.where(rank < columns, key, start[key] + rank // columns - 1)
+    return row, rank % columns, np.repeat(np.arange(rows), more)
+
+
+def columns_for(owned: np.ndarray) -> int:
+    """How many columns cost least, if each particle owns so many edges."""
+    widths = np.arange(1, max(2, min(owned.max(), LONGEST_ROW) + 1))
+    rows = np.array([np.maximum(-(-owned // width), 1).sum() for width in widths])
+    return int(widths[np.argmin(widths * rows + FURTHER_COST * (rows - len(owned)))])
 
 
 def near_order(edges: np.ndarray, particles: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from jeuler.forces.layouts import Layout, Pairs, Rows, Shifts
 MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
 SHIFT_GAIN = 4  # how many slots of Shifts cost what one edge costs in Rows
 FEW = 8  # Pairs for less than one edge in so many particles,
-MANY = 8000  # and for less than so many edges: their arrays stay in the nearest caches, where scatters are cheap
+MANY = 500  # and for less than so many edges: a scatter of so few costs less than the many kernels of Rows
 
 
 class Indices:
