@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler import _check, _tree
+from jeuler._members import recomputed
 from jeuler.methods import Step, VectorField, euler_step
 from jeuler.reversible import check as check_reversible
 from jeuler.reversible import reversible
@@ -276,7 +277,6 @@ def _recomputed(advance: Callable) -> Callable:
     """The same function, of which reverse mode keeps nothing but the arguments."""
 
     def outer(f, t, y_and_lost, dt, args):
-        inner = jax.checkpoint(functools.partial(advance, f), prevent_cse=False)
-        return inner(t, y_and_lost, dt, args)
+        return recomputed(functools.partial(advance, f))(t, y_and_lost, dt, args)
 
     return outer
