@@ -19,16 +19,18 @@ Jaxpr = Any
 
 written_out: dict[Any, Callable] = {}  # primitives that other operations express: (*operands, **parameters) -> results
 
-ELEMENTWISE = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp complex conj convert_element_type copy "
-    "cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt imag integer_pow is_finite le lgamma log "
-    "log1p logistic lt max min mul ne neg nextafter not or pow real reduce_precision rem round rsqrt select_n "
-    "shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stored sub tan tanh xor".split()
-)
-ALONG_AXES = frozenset(
-    "argmax argmin concatenate cummax cummin cumprod cumsum reduce_and reduce_max reduce_min reduce_or reduce_prod "
-    "reduce_sum rev split squeeze stack unstack".split()
-)
+ELEMENTWISE = frozenset([
+    "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
+    "clamp", "complex", "conj", "convert_element_type", "copy", "cos", "cosh", "digamma", "div", "eq", "erf",
+    "erf_inv", "erfc", "exp", "exp2", "expm1", "floor", "ge", "gt", "imag", "integer_pow", "is_finite", "le",
+    "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow",
+    "real", "reduce_precision", "rem", "round", "rsqrt", "select_n", "shift_left", "shift_right_arithmetic",
+    "shift_right_logical", "sign", "sin", "sinh", "sqrt", "square", "stored", "sub", "tan", "tanh", "xor",
+])  # fmt: skip
+ALONG_AXES = frozenset([
+    "argmax", "argmin", "concatenate", "cummax", "cummin", "cumprod", "cumsum", "reduce_and", "reduce_max",
+    "reduce_min", "reduce_or", "reduce_prod", "reduce_sum", "rev", "split", "squeeze", "stack", "unstack",
+])  # fmt: skip
 OF_SHAPES: dict[str, Callable] = {
     "broadcast_in_dim": lambda x, size, shape, broadcast_dimensions, **_: lax.broadcast_in_dim(
         x, (*shape, size), (*broadcast_dimensions, len(shape))
@@ -97,12 +99,12 @@ def _evaluate(jaxpr, consts, operands, batched, size) -> tuple[list, list[bool]]
         return [x for x, _ in pairs], [b for _, b in pairs]
 
     for eqn in jaxpr.eqns:
-        results, flags = _apply(eqn, *read(eqn.invars), size)
+        results, flags = _apply(eqn, size, *read(eqn.invars))
         values.update(zip(eqn.outvars, zip(results, flags, strict=True), strict=True))
     return read(jaxpr.outvars)
 
 
-def _apply(eqn, operands, batched, size) -> tuple[list, list[bool]]:
+def _apply(eqn, size, operands, batched) -> tuple[list, list[bool]]:
     def bind(*operands):
         out = eqn.primitive.bind(*operands, **eqn.params)
         return out if eqn.primitive.multiple_results else [out]
@@ -117,10 +119,8 @@ def _apply(eqn, operands, batched, size) -> tuple[list, list[bool]]:
         return jax.vmap(bind, [-1 if b else None for b in batched], -1, axis_size=size)(*operands), [True] * count
     if name in OF_SHAPES:
         return [OF_SHAPES[name](*operands, size=size, **eqn.params)], [True]
-    if name in ELEMENTWISE:
-        shapes = [eqn.outvars[0].aval.shape] * len(operands)
-    else:
-        shapes = [v.aval.shape for v in eqn.invars]
+    of = eqn.outvars * len(operands) if name in ELEMENTWISE else eqn.invars
+    shapes = [v.aval.shape for v in of]
     return bind(*(_spread(x, b, s, size) for x, b, s in zip(operands, batched, shapes, strict=True))), [True] * count
 
 
