@@ -29,7 +29,7 @@ def loss(position, ks, kd):
 
 def one_by_one(function):
     """What ``vmap`` does, as a loop over members: nothing is batched."""
-    return lambda *stacked: lax.map(lambda member: function(*member), stacked)
+    return lambda *stacked: lax.map(lambda member: function(*member), tuple(map(jnp.asarray, stacked)))
 
 
 @pytest.fixture(scope="module")
@@ -62,24 +62,30 @@ def test_gradients_of_an_ensemble_are_those_of_its_members(members):
         np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
 
 
-def test_batches_nest_around_and_inside_derivatives(members):
-    position, ks, kd = members
+def orbit(y, k):
+    """Where a pendulum is after a few steps."""
+    return jeuler.solve(lambda t, y, k: jnp.stack([y[1], -k * jnp.sin(y[0])]), y, dt=0.1, num_steps=3, args=k).y[-1]
 
-    def pairs(function):  # (2 members) of (COUNT springs) of one position
-        return function(lambda k: function(lambda p: jax.grad(loss, argnums=1)(p, k, kd))(position[:2]))(ks)
 
-    def outer_gradient(function):
-        def total(k):
-            return jnp.sum(function(lambda p: jnp.sum(function(lambda k: loss(p, k, kd))(k)))(position[:2]))
+def gradients_of_pairs(vmap):
+    return vmap(lambda k: vmap(lambda y: jax.grad(lambda k: jnp.sum(orbit(y, k)))(k))(STARTS))(STIFFNESS)
 
-        return jax.grad(total)(ks)
 
-    def one_axis(f):
-        return one_by_one(f)
+def gradient_of_all_pairs(vmap):
+    return jax.grad(lambda k: jnp.sum(vmap(lambda y: vmap(lambda k: orbit(y, k) ** 2)(k))(STARTS)))(STIFFNESS)
 
-    for check in (pairs, outer_gradient):
-        ours, theirs = (jax.jit(functools.partial(check, f))() for f in (jax.vmap, one_axis))
-        np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
+
+def jacobians(vmap):
+    return vmap(lambda k: jax.jacfwd(jax.jacrev(lambda y: orbit(y, k)))(STARTS[1]))(STIFFNESS)
+
+
+STARTS, STIFFNESS = np.array([[0.3, 0.1], [1.0, -2.0]]), np.linspace(1, 4, COUNT)
+
+
+@pytest.mark.parametrize("function", [gradients_of_pairs, gradient_of_all_pairs, jacobians])
+def test_batches_nest_around_and_inside_derivatives(function):
+    ours, theirs = (jax.jit(functools.partial(function, vmap))() for vmap in (jax.vmap, one_by_one))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
 def test_one_member_that_overflows_leaves_the_others_alone(members):
@@ -108,9 +114,11 @@ cube.defjvp(lambda primals, tangents: (cube(*primals), 3 * primals[0] ** 2 * tan
 
 def many_operations(x, n, shared):
     """x (3, 4), n () and shared (4,), through operations of all kinds."""
-    y = jnp.where(x > n, cube(x), shared) + jnp.pad(x[1:, ::2], ((0, 1), (1, 1)), constant_values=2.0)
-    z = jnp.concatenate([y, jnp.cumsum(y, axis=0)[:, :2], jnp.ones((3, 1)) * n], axis=1).T.reshape(3, 7)
-    w = jnp.stack([jnp.max(z, axis=1), jnp.sum(z * z, axis=1), z[:, 0]], axis=1)[::-1]
+    y = jnp.where(x > n, cube(x), shared) + jnp.pad(
+        lax.slice(x, (1, 0), (3, 4), (1, 2)), ((0, 1), (1, 1)), constant_values=2.0
+    )
+    z = jnp.concatenate([y, jnp.cumsum(y, axis=0), jnp.ones((3, 1)) * n], axis=1).T.reshape(3, 9)
+    w = jnp.stack([jnp.max(z, axis=1), jnp.sum(z * z, axis=1), jnp.min(jnp.flip(z), axis=1)], axis=1)
     return jnp.clip(w, 0, n), jnp.argmax(w, axis=1), lax.split(w, (1, 2))[1] % shared[:2, None], jnp.tanh(n), shared * 2
 
 
@@ -125,6 +133,7 @@ def test_operations_with_the_batch_axis_last_are_those_of_vmap(function, expecte
     closed = jax.make_jaxpr(function)(x[0], n[0], shared)
     batched = [True, True, False]
     assert fits(closed.jaxpr, batched) == expected
-    ours = batch_last(closed.jaxpr, closed.consts, (jnp.moveaxis(x, 0, -1), n, shared), batched, 6)
-    for last, first in zip(ours, jax.vmap(function, (0, 0, None))(x, n, shared), strict=True):
+    ours = jax.jit(lambda *operands: batch_last(closed.jaxpr, closed.consts, operands, batched, 6))
+    theirs = jax.jit(jax.vmap(function, (0, 0, None)))
+    for last, first in zip(ours(jnp.moveaxis(x, 0, -1), n, shared), theirs(x, n, shared), strict=True):
         np.testing.assert_allclose(jnp.moveaxis(last, -1, 0), first, rtol=1e-12)
