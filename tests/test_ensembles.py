@@ -9,10 +9,9 @@ import pytest
 from jax import lax
 
 import jeuler
-from jeuler import _members
 from jeuler._batch_last import batch_last, fits
 
-COUNT, PARTICLES = _members.MANY, 5
+COUNT, PARTICLES = 64, 5
 EDGES = [(i, i + 1) for i in range(PARTICLES - 1)]
 
 
