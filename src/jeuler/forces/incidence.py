@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.interpreters import ad, batching, mlir
 
+from jeuler import _batch_last
 from jeuler.forces.hints import Primitive
 
 difference_p = Primitive("difference")
@@ -75,3 +76,4 @@ for primitive, transpose, rule, shape in (
     primitive.def_abstract_eval(shape)
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=False))
     _linear(primitive, transpose)
+    _batch_last.written_out[primitive] = rule

@@ -32,6 +32,7 @@ import jax
 from jax import Array
 from jax.interpreters import ad, batching, mlir
 
+from jeuler import _batch_last
 from jeuler.forces.hints import Primitive, padded, stored
 
 products_p = Primitive("products")
@@ -122,6 +123,7 @@ for primitive, rule in ((products_p, _products), (laplacian_p, _laplacian)):
     primitive.def_impl(jax.jit(rule, static_argnames="offsets"))
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=primitive.multiple_results))
     batching.primitive_batchers[primitive] = _batched(primitive)
+    _batch_last.written_out[primitive] = rule
 
 products_p.def_abstract_eval(
     lambda x, y, *, offsets: [jax.core.ShapedArray((*x.shape[:-1], x.shape[-1] + k), x.dtype) for k in offsets]
