@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler import _check, _tree
+from jeuler._members import recomputed
 from jeuler.methods import Step, VectorField, euler_step
 from jeuler.reversible import check as check_reversible
 from jeuler.reversible import reversible
@@ -248,7 +249,7 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
             _check.same_form("the step", y, y_next)
             return y_next, None
 
-        return _recomputed(plain) if hasattr(step, "increment") else plain
+        return recomputed(plain) if hasattr(step, "increment") else plain
 
     if not hasattr(step, "increment"):
         name = getattr(step, "__name__", repr(step))
@@ -269,14 +270,4 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
         pairs = jax.tree.map(two_sum, y, increment)
         return jax.tree.transpose(jax.tree.structure(y), jax.tree.structure((0, 0)), pairs)
 
-    return _recomputed(compensating)
-
-
-def _recomputed(advance: Callable) -> Callable:
-    """The same function, of which reverse mode keeps nothing but the arguments."""
-
-    def outer(f, t, y_and_lost, dt, args):
-        inner = jax.checkpoint(functools.partial(advance, f), prevent_cse=False)
-        return inner(t, y_and_lost, dt, args)
-
-    return outer
+    return recomputed(compensating)

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.interpreters import ad, batching, mlir
 
+from jeuler import _batch_last
+
 Primitive: Any = type(lax.add_p)  # jax.extend.core.Primitive; that module would import Pallas too
 
 stored_p = Primitive("stored")
@@ -133,6 +135,7 @@ for primitive, rule, shape in (
 ):
     primitive.def_impl(jax.jit(rule, static_argnames="layout"))
     primitive.def_abstract_eval(shape)
+    _batch_last.written_out[primitive] = rule
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=primitive.multiple_results))
 
 ad.primitive_jvps[difference_p] = _difference_jvp
