@@ -28,6 +28,9 @@ Jaxpr = Any
 MANY = 64  # members from which on the batch axis goes last,
 SHORT = 48  # if no operand of one member has a longer last axis: longer loops are as fast as they are
 
+# Operands to results. Parameters: the jaxpr of one member; ``size``, how many members have their axis in the operands,
+# None for one alone; ``axes``, where in each operand, None if it is the same for all; ``batched``, which results depend
+# on the member, their axis first; ``differentiated``, whether a derivative was taken of the equation, or is it.
 members_p: Any = type(lax.add_p)("members")
 members_p.multiple_results = True
 
