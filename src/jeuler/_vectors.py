@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import Array
+
+
+def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
+    """x.y of vectors given as one array a component."""
+    first, *others = (a * b for a, b in zip(x, y, strict=True))
+    return sum(others, first)
 
 
 def apart(square: Array) -> Array:

@@ -17,29 +17,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import lax
 from jax.interpreters import ad, batching, mlir
 
-Primitive: Any = type(lax.add_p)  # jax.extend.core.Primitive; that module would import Pallas too
-
-stored_p = Primitive("stored")
-
-
-def stored(x: Array) -> Array:
-    """x and its cotangent, each worked out once and stored, not again for each of its uses.
-
-    XLA on CPU fuses what it thinks cheap into every consumer: what a spring gives to its two ends, a dozen
-    operations, would be done twice, once for either end. A division it never repeats. This is one, by a number
-    that is 1 but not a constant to XLA; LLVM, which comes after, knows that no float is greater than inf and
-    drops the division.
-    """
-    return stored_p.bind(x)
-
-
-def as_stored(x):
-    """The arithmetic of `stored`, for use inside the two maps."""
-    return x / jnp.where(x > jnp.inf, 2, 1).astype(x.dtype)
-
+from jeuler.forces.hints import Primitive
 
 difference_p = Primitive("difference")
 difference_p.multiple_results = True
@@ -77,16 +58,13 @@ def _accumulate_jvp(primals, tangents, *, layout):
 
 def _difference_transpose(cotangents, x, *tables, layout):
     slots = map(ad.instantiate_zeros, cotangents)
-    if layout.copies == 2:  # where both ends share one slot, what is worth storing is stored by Layout.stored
-        slots = map(stored, slots)
-    total = accumulate_p.bind(*slots, *tables, layout=layout)
-    return [layout.copies * total, *[None] * len(tables)]
+    return [accumulate_p.bind(*slots, *tables, layout=layout), *[None] * len(tables)]
 
 
 def _accumulate_transpose(cotangent, *operands, layout):
     tables = operands[len(layout.slot_edges) :]
     slots = difference_p.bind(ad.instantiate_zeros(cotangent), *tables, layout=layout)
-    return [*(f / layout.copies if layout.copies > 1 else f for f in slots), *[None] * len(tables)]
+    return [*slots, *[None] * len(tables)]
 
 
 def _batch_first(x: Any, axis: Any, size: int) -> Any:
@@ -120,12 +98,6 @@ def _accumulate_batch(operands, axes, *, layout):
     slots = [_batch_first(x, axis, sizes[0]) for x, axis in zip(operands[:groups], axes[:groups], strict=True)]
     return accumulate_p.bind(*slots, *tables, layout=layout), 0
 
-
-stored_p.def_impl(lambda x: x)
-stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
-mlir.register_lowering(stored_p, mlir.lower_fun(as_stored, multiple_results=False))
-ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])
-batching.defvectorized(stored_p)
 
 for primitive, rule, shape in (
     (difference_p, _difference, _difference_shape),

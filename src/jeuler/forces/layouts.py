@@ -1,39 +1,40 @@
-"""Layouts: in what order the edges of a graph lie in memory, so that the incidence operator and its transpose
-are fast.
+"""Layouts: in what order the edges of a graph lie in memory, so that a force along them is fast.
 
-- `Shifts`: all edges (i, i + k) of one offset k make a group. B subtracts an array from itself shifted by k,
-B^T adds
+    F = B^T (c B x),   c = law(|B x|^2, (B v).(B x), parameters)   one number an edge
+
+- `Shifts`: all edges (i, i + k) of one offset k make a group. B subtracts an array from itself shifted by k, B^T adds
   two shifted copies. Slots are contiguous, nothing is looked up. Cloth, ropes, hair, lattices.
 - `Rows`: any graph. One end owns the edge and has its slot in its row: B gathers the far ends, B^T sums a row and
   gathers what the other edges of the particle give.
 - `Pairs`: a few edges, or few hundred. Two gathers and two scatters, as one would write it by hand.
 
-Slots may be empty; what a force puts there must be 0, which `Layout.to_slots` sees to.
+Slots may be empty; c is 0 there, or B x is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jeuler._vectors import dot
 from jeuler.forces import incidence
+from jeuler.forces.hints import kept, stored
+from jeuler.forces.laplacian import laplacian, products
+
+Law = Callable[..., Array]  # (square, approach, *parameters) -> c, elementwise
 
 
 class Layout:
     """Where the edges lie in memory. Hashable by identity: layouts are made once a topology and cached.
 
     Attributes:
-      copies: how often each edge is held, 1 or 2.
-      clean: whether B x is 0 in empty slots. Where it is not, a force must vanish there: stiffness 0 does it.
       slot_edges: one integer array a group: the edge in each slot, -1 for none.
       tables: the integer and boolean arrays that the two maps look things up in.
     """
 
-    copies: int
-    clean: bool
     particles: int
     slot_edges: tuple[np.ndarray, ...]
     tables: tuple[np.ndarray, ...]
@@ -46,21 +47,31 @@ class Layout:
         """B^T f: one array of slots a group to (particle,)."""
         return incidence.accumulate_p.bind(*slots, *self.tables, layout=self)
 
-    def stored(self, slots: list[Array]) -> list[Array]:
-        """The same slots, they and their cotangents stored if both ends of an edge read one slot.
+    def central_force(
+        self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
+    ) -> list[Array]:
+        """B^T (c B x) with c = law(|B x|^2, (B v).(B x), *parameters): (particle,) for each component of x.
 
-        For the d of springs, whose cotangent is a sum of products; that of the velocities is one product, better
-        worked out again at either end (cloth 64 x 64: the gradient takes 5.1 instead of 6.4 ns a spring).
+        Parameters are what `to_slots` made of them.
         """
-        return [incidence.stored(x) for x in slots] if self.copies == 1 else slots
+        d, s = ([self.difference(component) for component in y] for y in (x, v))
+        # both ends read one slot: stored, its cotangent too, not worked out again for either
+        d = [[stored(slots) for slots in component] for component in d]
+        by_group = zip(zip(*d, strict=True), zip(*s, strict=True), *parameters, strict=True)
+        c = [stored(law(dot(d, d), dot(s, d), *own)) for d, s, *own in by_group]
+        return [self.accumulate([a * b for a, b in zip(c, component, strict=True)]) for component in d]
 
-    def to_slots(self, x: Array) -> list[Array]:
-        """A value of each edge, () or (edge,), as one array a group; empty slots hold 0 where B x may not be
-        0."""
+    def to_slots(self, x: Array) -> list[Array] | Array:
+        """A value of each edge, () or (edge,), as one array a group with 0 in empty slots, or what `by_group` takes."""
         if x.ndim == 0:
-            return [x if self.clean else jnp.where(edges < 0, 0, x) for edges in self.slot_edges]
+            return [x] * len(self.slot_edges)
         x = jnp.concatenate([x, jnp.zeros_like(x, shape=(1,))])  # slot -1 reads the zero at the end
         return [x[np.where(edges < 0, len(x) - 1, edges)] for edges in self.slot_edges]
+
+    def by_group(self, parameter: list[Array] | Array) -> list[Array]:
+        """What `to_slots` made, as one array a group."""
+        assert isinstance(parameter, list)
+        return parameter
 
     def _difference(self, x: Array, *tables: Array) -> list[Array]:
         raise NotImplementedError
@@ -72,17 +83,9 @@ class Layout:
 class Shifts(Layout):
     """Edges of constant offset k: slot s of a group holds the edge (s - k, s).
 
-        x padded      0 0 | x0 x1 x2 x3 | 0 0        k = 2
-        minus shifted       0  0  x0 x1 x2 x3        slots 0 .. particles + k - 1; the first and last k are
-        empty B^T f at i    = f[i + k] - f[i]
-
-    The padding costs k empty slots at each end and frees both maps of branches, so that they vectorise. A
-    slot takes 2 loads a component in B, 2 in B^T, no index and no mask: an empty slot holds the difference of
-    some two particles, which a stiffness of 0 takes out.
+    The two maps and the layout of their slots are those of `jeuler.forces.laplacian`. What is one number for all edges
+    is one array for all groups, of the longest one's length: half the memory traffic of cloth.
     """
-
-    copies = 1
-    clean = False
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         low, high = edges.min(axis=1), edges.max(axis=1)
@@ -97,15 +100,25 @@ class Shifts(Layout):
         self.slot_edges = tuple(groups)
         self.tables = ()
 
-    def _difference(self, x, *tables):
-        n, reach = self.particles, max(self.offsets)
-        # a pad alone runs through an older, slower loop of XLA on CPU than one fused with arithmetic: 20 % of the step
-        x = jnp.pad(incidence.as_stored(x), [(0, 0)] * (x.ndim - 1) + [(reach, reach)])
-        return [x[..., reach - k : reach + n] - x[..., reach : reach + n + k] for k in self.offsets]
+    def central_force(self, law, x, v, parameters):
+        x, v = ([kept(component) for component in y] for y in (x, v))
+        squares, approaches = (self.dot_differences(y, x) for y in (x, v))
+        values = map(law, squares, approaches, *map(self.by_group, parameters))
+        c = [stored(jnp.where(edges < 0, 0, value)) for edges, value in zip(self.slot_edges, values, strict=True)]
+        return [laplacian(c, component, self.offsets) for component in x]
 
-    def _accumulate(self, slots, *tables):
-        n = self.particles
-        return sum(f[..., k:] - f[..., :n] for k, f in zip(self.offsets, slots, strict=True))
+    def dot_differences(self, x: Sequence[Array], y: Sequence[Array]) -> list[Array]:
+        """(B x).(B y), one array a group."""
+        first, *others = (products(a, b, self.offsets) for a, b in zip(x, y, strict=True))
+        return [sum(terms, start) for start, *terms in zip(first, *others, strict=True)]
+
+    def to_slots(self, x):
+        return jnp.broadcast_to(x, self.particles + max(self.offsets)) if x.ndim == 0 else super().to_slots(x)
+
+    def by_group(self, parameter: list[Array] | Array) -> list[Array]:
+        if isinstance(parameter, list):
+            return parameter
+        return [parameter[: self.particles + k] for k in self.offsets]
 
 
 LONGEST_ROW = 32  # slots that one row looks up; the hub that meets more edges has several rows
@@ -132,9 +145,6 @@ class Rows(Layout):
     springs in 3-D 12 gathers instead of 9, and 2 square roots and 4 divisions instead of half; in the gradient 18
     instead of 15.
     """
-
-    copies = 1
-    clean = True
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles
@@ -190,7 +200,7 @@ class Rows(Layout):
     def _accumulate(self, slots, *tables):
         _, place, _, more, meets_more, *meets = tables
         # XLA would fuse what f is made of into its gathers: one more gather for each factor.
-        (f,) = map(incidence.as_stored, slots)
+        (f,) = map(stored, slots)
         flat = f.reshape(*f.shape[:-2], -1)
         given = sum_of_columns(f)
         met = jnp.concatenate([sum_of_columns(take(flat, table)) for table in meets], axis=-1)
@@ -209,9 +219,6 @@ class Pairs(Layout):
     from 164 on both take the same, and 866 springs take 11 instead of 7 ns in `Rows`, their gradient the same, in a
     batch of 32 9.1 instead of 8.0 and 46 instead of 40.
     """
-
-    copies = 1
-    clean = True
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -11,46 +10,50 @@ from jax import Array
 
 from jeuler import _check, _tree
 from jeuler._components import split, stack
-from jeuler._vectors import apart, direction
-from jeuler.forces.incidence import stored
+from jeuler._vectors import apart, direction, dot
+from jeuler.forces.hints import stored
 from jeuler.forces.layouts import Layout
 from jeuler.forces.topology import Topology
 
 
 @jax.custom_jvp
-def length(square: Array) -> Array:
-    """r from r^2; 0, and all derivatives 0, where the ends coincide (see `apart`). dr = d(r^2) / 2r."""
-    return jnp.sqrt(jnp.where(apart(square), square, 0))
+def inverse_length(square: Array) -> Array:
+    """1 / r from r^2; 0, and all derivatives 0, where the ends coincide (see `apart`)."""
+    long = apart(square)
+    return jnp.where(long, 1, 0) / jnp.where(long, jnp.sqrt(jnp.where(long, square, 1)), 1)
 
 
-@length.defjvp
-def _length_jvp(primals, tangents):
-    r = length(*primals)
-    (change,) = tangents
-    return r, jnp.where(r > 0, change / 2, 0) / jnp.where(r > 0, r, 1)
+@inverse_length.defjvp
+def _inverse_length_jvp(primals, tangents):
+    i = inverse_length(*primals)
+    change = (i / 2) * tangents[0]  # of r; i^3 by itself would overflow before i^2 does
+    return i, -(i * i) * change
 
 
-def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
-    """x.y of vectors given as one array a component."""
-    return sum(a * b for a, b in zip(x, y, strict=True))  # type: ignore[return-value]
+@jax.custom_jvp
+def coefficient(square: Array, approach: Array, ks: Array, kd: Array, rest_length: Array) -> Array:
+    """The force on the first end of a spring is c d, with d = p_i - p_j, r^2 = d.d and a = (v_i - v_j).d,
 
+        c = (ks L - kd a / r) / r - ks
 
-def spring_force(
-    d: Sequence[Array], relative_velocity: Sequence[Array], ks: Array, kd: Array, rest_length: Array
-) -> list[Array]:
-    """The force on the first end of each spring, from d = p_i - p_j and v_i - v_j, one array a component.
-
-        F = c d,   c = (ks L - kd v.u) / r - ks,   u = d / r
-
-    At r = 0, c is the number -ks with all its derivatives 0 (see `apart`), so that for L = 0 the Jacobian
-    there is -ks I. One number c a spring, stored: the components of F, at either end, are products with it.
+    At r = 0, c is the number -ks with all its derivatives 0 (see `apart`), so that for L = 0 the Jacobian there is
+    -ks I.
     """
-    r = length(dot(d, d))
-    long = r > 0
-    divisor = jnp.where(long, r, 1)
-    approach = dot(relative_velocity, d) / divisor
-    c = stored(jnp.where(long, ks * rest_length - kd * approach, 0) / divisor - ks)
-    return [c * component for component in d]
+    long = apart(square)
+    r = jnp.sqrt(jnp.where(long, square, 1))
+    return jnp.where(long, ks * rest_length - kd * (approach / r), 0) / r - ks
+
+
+@coefficient.defjvp
+def _coefficient_jvp(primals, tangents):
+    """Written in i = 1 / r, which is worked out once: what all derivatives share."""
+    square, a, ks, kd, rest_length = primals
+    i, a = inverse_length(square), stored(a)
+    c = (ks * rest_length - kd * (a * i)) * i - ks
+    by_r = (i * i) * (2 * kd * a * i - ks * rest_length)
+    slopes = (by_r, -kd * (i * i), rest_length * i - 1, -a * (i * i), ks * i)
+    changes = ((i / 2) * tangents[0], *tangents[1:])
+    return c, dot(slopes, changes)
 
 
 @_tree.component(static=("edges",))
@@ -123,7 +126,7 @@ class Springs:
 
 @_tree.component(static=("edges", "layouts"))
 class PreparedSprings:
-    """Springs as the kernels take them: B^T g(B x, B v) with the parameters in slots, a list a layout and group."""
+    """Springs as the kernels take them, with the parameters in the slots of each layout."""
 
     edges: Topology
     layouts: tuple[Layout, ...]
@@ -135,10 +138,7 @@ class PreparedSprings:
         x, v = split(position), split(velocity)
         total = [jnp.zeros_like(component) for component in x]
         for layout, *parameters in zip(self.layouts, self.ks, self.kd, self.rest_length, strict=True):
-            d = zip(*(layout.stored(layout.difference(component)) for component in x), strict=True)
-            relative_velocity = zip(*map(layout.difference, v), strict=True)
-            forces = [spring_force(*group) for group in zip(d, relative_velocity, *parameters, strict=True)]
-            shares = map(layout.accumulate, zip(*forces, strict=True))
+            shares = layout.central_force(coefficient, x, v, parameters)
             total = [a + b for a, b in zip(total, shares, strict=True)]
         return stack(total)
 
@@ -146,5 +146,9 @@ class PreparedSprings:
         """Between the living only, as `Springs.among`."""
         both = jnp.all(alive[self.edges[:]], axis=1)
         here = [layout.to_slots(both) for layout in self.layouts]
-        ks, kd = (jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, x) for x in (self.ks, self.kd))
-        return _tree.replace(self, ks=ks, kd=kd)
+
+        def only_here(parameter):
+            groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
+            return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
+
+        return _tree.replace(self, ks=only_here(self.ks), kd=only_here(self.kd))
