@@ -59,7 +59,7 @@ class Layout:
         return parameter
 
 
-class Looked(Layout):
+class Indexed(Layout):
     """Edges in one group of slots, whose ends are looked up in tables: B and B^T are primitives of their own.
 
     Attributes:
@@ -137,7 +137,7 @@ MOST_TURNS = 100  # of edges from one owner to the other; a mesh needs 30
 FURTHER_COST = 16  # slots that a further row of a particle costs, as its sum is scattered
 
 
-class Rows(Looked):
+class Rows(Indexed):
     """Any graph: each edge has one slot, in the row of the one end that owns it; the other end looks it up.
 
         row 7 owns    (7, 2) (7, 9) (7, 30)  -       B x:    x7 - x2, x7 - x9, x7 - x30, 0
@@ -221,7 +221,7 @@ class Rows(Looked):
         return take(total, place)
 
 
-class Pairs(Looked):
+class Pairs(Indexed):
     """Few edges, as one would write it: a slot an edge, two gathers in B, two scatters in B^T.
 
     As many slots as edges, no padding, and the shortest program. 46 edges take half as long as in `Rows`; 164 as long;
