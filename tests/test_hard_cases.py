@@ -287,7 +287,8 @@ def test_capped_cotangent_bounds_the_gradient_of_a_chaotic_run():
     assert abs(jax.grad(free)(2.2)) > 1e3
     assert abs(jax.grad(capped)(2.2)) <= 2.0 * 3
     loose = pendulum(200, cap_cotangent(jeuler.symplectic_euler_step, 1e9))
-    assert jax.grad(loose)(2.2) == jax.grad(pendulum(200, jeuler.symplectic_euler_step))(2.2)
+    expected = jax.grad(pendulum(200, jeuler.symplectic_euler_step))(2.2)
+    np.testing.assert_allclose(jax.grad(loose)(2.2), expected, rtol=1e-12)  # the two programs round apart
 
 
 def test_cap_must_be_positive():
