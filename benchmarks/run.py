@@ -128,15 +128,15 @@ def figure(results: dict, path: pathlib.Path) -> None:
     )
     for ax in axes.ravel()[len(results) :]:
         ax.axis("off")
+    peers = [peer for peer in PEERS if any((peer, FORWARD) in times for times in results.values())]
     for index, (ax, (work, times)) in enumerate(zip(axes.ravel(), results.items(), strict=False)):
-        peers = list(dict.fromkeys(peer for peer, _ in times))
         for place, peer in enumerate(peers):
             color = "tab:orange" if peer == "jeuler" else "tab:blue"
             for kind, shift, alpha in ((FORWARD, -0.2, 1.0), (GRADIENT, 0.2, 0.45)):
                 if (peer, kind) in times:
                     ax.barh(place + shift, times[peer, kind], height=0.38, color=color, alpha=alpha)
-        ax.set_yticks(range(len(peers)), peers if index % columns == 0 or len(peers) < 5 else [""] * len(peers))
-        ax.invert_yaxis()
+        ax.set_yticks(range(len(peers)), [""] * len(peers) if index % columns else peers)
+        ax.set_ylim(len(peers) - 0.5, -0.5)
         ax.set_xscale("log")
         ax.set_xlim(left=min(times.values()) / 3)
         ax.set_title(work, fontsize=9)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-Jaxpr = Any
+from jeuler._jaxpr import Jaxpr, is_variable
 
 written_out: dict[Any, Callable] = {}  # primitives that other operations express: (*operands, **parameters) -> results
 
@@ -70,12 +70,12 @@ def _flow(jaxpr: Jaxpr, batched: tuple[bool, ...]) -> tuple[bool, tuple[bool, ..
     found = {v for v, b in zip(jaxpr.invars, batched, strict=True) if b}
     all_fit = True
     for eqn in jaxpr.eqns:
-        of = tuple(_is_variable(v) and v in found for v in eqn.invars)
+        of = tuple(is_variable(v) and v in found for v in eqn.invars)
         if any(of):
             found.update(eqn.outvars)
             inner = _inner(eqn)
             all_fit &= fits(inner[0], of) if inner else _has_form(eqn, of)
-    return all_fit, tuple(_is_variable(v) and v in found for v in jaxpr.outvars)
+    return all_fit, tuple(is_variable(v) and v in found for v in jaxpr.outvars)
 
 
 def _has_form(eqn: Any, batched: Sequence[bool]) -> bool:
@@ -95,7 +95,7 @@ def _evaluate(jaxpr, consts, operands, batched, size) -> tuple[list, list[bool]]
     values |= {v: (x, b) for v, x, b in zip(jaxpr.invars, operands, batched, strict=True)}
 
     def read(variables):
-        pairs = [values[v] if _is_variable(v) else (jnp.asarray(v.val, v.aval.dtype), False) for v in variables]
+        pairs = [values[v] if is_variable(v) else (jnp.asarray(v.val, v.aval.dtype), False) for v in variables]
         return [x for x, _ in pairs], [b for _, b in pairs]
 
     for eqn in jaxpr.eqns:
@@ -146,7 +146,3 @@ def _inner(eqn: Any) -> tuple[Jaxpr, Sequence] | None:
 def _written(primitive: Any, forms: tuple, params: tuple) -> Jaxpr:
     function = functools.partial(written_out[primitive], **dict(params))
     return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(*form) for form in forms))
-
-
-def _is_variable(v: Any) -> bool:
-    return not hasattr(v, "val")  # else a literal

@@ -18,12 +18,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jeuler._batch_last import batch_last, fits, reached
-
-Jaxpr = Any
+from jeuler._jaxpr import Jaxpr, Primitive, evaluate
 
 MANY = 64  # members from which on the batch axis goes last,
 SHORT = 48  # if no operand of one member has a longer last axis: longer loops are as fast as they are
@@ -31,7 +29,7 @@ SHORT = 48  # if no operand of one member has a longer last axis: longer loops a
 # Operands to results. Parameters: the jaxpr of one member; ``size``, how many members have their axis in the operands,
 # None for one alone; ``axes``, where in each operand, None if it is the same for all; ``batched``, which results depend
 # on the member, their axis first; ``differentiated``, whether a derivative was taken of the equation, or is it.
-members_p: Any = type(lax.add_p)("members")
+members_p = Primitive("members")
 members_p.multiple_results = True
 
 
@@ -54,11 +52,6 @@ def recomputed(function: Callable) -> Callable:
         return jax.tree.unflatten(jax.tree.structure(form), results)
 
     return call
-
-
-def evaluate(jaxpr: Jaxpr, operands: Sequence) -> list:
-    """The results of one member."""
-    return jax.core.eval_jaxpr(jaxpr.jaxpr, jaxpr.consts, *operands)
 
 
 def _compiled(*operands, jaxpr, size, axes, batched, differentiated):

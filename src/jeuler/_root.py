@@ -13,8 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+
+from jeuler._jaxpr import Primitive, evaluate
 
 root_p = Primitive("root")
 root_p.multiple_results = True
@@ -74,7 +75,7 @@ def _split(operands: Any, sizes: tuple[int, ...]) -> list[tuple]:
 
 @root_p.def_impl
 def _run(guess, *consts, programs, sizes):
-    return jaxpr_as_fun(programs[0])(*_split(consts, sizes)[0], guess)
+    return evaluate(programs[0], [*_split(consts, sizes)[0], guess])
 
 
 @root_p.def_abstract_eval
@@ -97,10 +98,10 @@ def _jvp(primals, tangents, *, programs, sizes):
         operands = list(of_f)
         for n, value in zip(moving, values, strict=True):
             operands[n] = value
-        return jaxpr_as_fun(programs[1])(*operands, x)[0]
+        return evaluate(programs[1], [*operands, x])[0]
 
     _, residual_dot = jax.jvp(residual, [of_f[n] for n in moving], [f_dot[n] for n in moving])
-    (minus_x_dot,) = jaxpr_as_fun(programs[2])(*of_tangent_solve, x, residual_dot)
+    (minus_x_dot,) = evaluate(programs[2], [*of_tangent_solve, x, residual_dot])
     return [x, *info], [-minus_x_dot, *no_tangents]
 
 
@@ -114,7 +115,7 @@ def _batch(operands, axes, *, programs, sizes):
     guess = jnp.broadcast_to(guess, (size, *guess.shape)) if axis is None else jnp.moveaxis(guess, axis, 0)
 
     def batched(program, consts, axes, *x):
-        function = jax.vmap(jaxpr_as_fun(program), in_axes=(*axes, *(0 for _ in x)))
+        function = jax.vmap(lambda *operands: evaluate(program, operands), in_axes=(*axes, *(0 for _ in x)))
         return jax.make_jaxpr(function)(*consts, *x)
 
     parts = zip(programs, _split(consts, sizes), _split(axes[1:], sizes), (1, 1, 2), strict=True)

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.extend.core import Literal
 
 from jeuler import _check, _tree
+from jeuler._jaxpr import is_variable
 from jeuler._newton import StepInfo, linear_solver_for, newton_then_damped, solve_linear
 from jeuler._root import root
 from jeuler.methods import Step, VectorField
@@ -227,7 +227,7 @@ def _velocity_decides(f: VectorField, t: Any, y: PyTree, args: Any) -> bool:
     touched = set(jaxpr.invars)
 
     def touches(variables):
-        return any(not isinstance(v, Literal) and v in touched for v in variables)
+        return any(is_variable(v) and v in touched for v in variables)
 
     for equation in jaxpr.eqns:
         if touches(equation.invars):

@@ -19,7 +19,7 @@ from jax import lax
 from jax.interpreters import ad, batching, mlir
 
 from jeuler import _batch_last
-from jeuler.forces.hints import Primitive
+from jeuler._jaxpr import Primitive
 
 difference_p = Primitive("difference")
 accumulate_p = Primitive("accumulate")

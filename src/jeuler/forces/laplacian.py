@@ -33,7 +33,8 @@ from jax import Array
 from jax.interpreters import ad, batching, mlir
 
 from jeuler import _batch_last
-from jeuler.forces.hints import Primitive, padded, stored
+from jeuler._jaxpr import Primitive
+from jeuler.forces.hints import padded, stored
 
 products_p = Primitive("products")
 products_p.multiple_results = True
