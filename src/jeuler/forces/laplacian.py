@@ -18,8 +18,8 @@ Edges of one offset k make a group. Slot s of its array holds the edge (s - k, s
     minus shifted       0  0  x0 x1 x2 x3        slots 0 .. particles + k - 1; the first and last k are empty
 
 The padding costs k empty slots at each end and frees both maps of branches, so that they vectorise: no index, no mask.
-A slot takes 4 loads and 3 flops a component in products, 6 loads (2 of c) and 6 flops in laplacian, which differences
-again what it would cost more to load. An empty slot holds some product; its c must be 0.
+A slot takes 4 loads and 3 flops a component in products, 4 loads (2 of them c) and 6 flops in laplacian, which takes
+the difference at both ends: to store it would cost more. An empty slot holds some product; its c must be 0.
 
 Operands: arrays (..., particle), and (..., slot) a group. Leading axes are batches, the same for all.
 """
