@@ -25,7 +25,7 @@ ELEMENTWISE = frozenset([
     "erf_inv", "erfc", "exp", "exp2", "expm1", "floor", "ge", "gt", "imag", "integer_pow", "is_finite", "le",
     "lgamma", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pow",
     "real", "reduce_precision", "rem", "round", "rsqrt", "select_n", "shift_left", "shift_right_arithmetic",
-    "shift_right_logical", "sign", "sin", "sinh", "sqrt", "square", "stored", "sub", "tan", "tanh", "xor",
+    "shift_right_logical", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan", "tanh", "xor",
 ])  # fmt: skip
 ALONG_AXES = frozenset([
     "argmax", "argmin", "concatenate", "cummax", "cummin", "cumprod", "cumsum", "reduce_and", "reduce_max",

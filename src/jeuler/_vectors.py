@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import jax.numpy as jnp
 from jax import Array
 
 
+def total(terms: Iterable[Array]) -> Array:
+    """The sum of one array or more, without the 0 that ``sum`` begins with."""
+    first, *others = terms
+    return sum(others, first)
+
+
 def dot(x: Sequence[Array], y: Sequence[Array]) -> Array:
     """x.y of vectors given as one array a component."""
-    first, *others = (a * b for a, b in zip(x, y, strict=True))
-    return sum(others, first)
+    return total(a * b for a, b in zip(x, y, strict=True))
 
 
 def apart(square: Array) -> Array:

@@ -108,7 +108,7 @@ def implicit_euler(
         """
         return with_info(f, t, y, dt, args)[0]
 
-    implicit_euler_step.with_info = with_info  # type: ignore[attr-defined]
+    implicit_euler_step.with_info = with_info  # type: ignore[attr-defined]  # functions may carry attributes
     implicit_euler_step.order = 1  # type: ignore[attr-defined]
     return implicit_euler_step
 

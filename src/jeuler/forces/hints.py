@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.interpreters import ad, batching, mlir
 
+from jeuler import _batch_last
 from jeuler._jaxpr import Primitive
 
 stored_p = Primitive("stored")
@@ -55,3 +56,4 @@ stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
 mlir.register_lowering(stored_p, mlir.lower_fun(as_stored, multiple_results=False))
 ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])
 batching.defvectorized(stored_p)
+_batch_last.written_out[stored_p] = as_stored

@@ -34,6 +34,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jeuler import _batch_last
 from jeuler._jaxpr import Primitive
+from jeuler._vectors import total
 from jeuler.forces.hints import padded, stored
 
 products_p = Primitive("products")
@@ -65,15 +66,11 @@ def _laplacian(*operands, offsets):
     *c, x = operands
     n, reach = x.shape[-1], max(offsets)
     around = padded(x, reach)
-    total = 0
+    force = 0
     for k, weight in zip(offsets, c, strict=True):
         before, behind = around[..., reach - k : reach - k + n], around[..., reach + k : reach + k + n]
-        total = total + weight[..., k:] * (x - behind) - weight[..., :n] * (before - x)
-    return total
-
-
-def _sum(terms: list) -> Array:
-    return sum(terms[1:], terms[0])
+        force = force + weight[..., k:] * (x - behind) - weight[..., :n] * (before - x)
+    return force
 
 
 def _products_jvp(primals, tangents, *, offsets):
@@ -82,7 +79,7 @@ def _products_jvp(primals, tangents, *, offsets):
     if x is y and dx is dy:
         return out, [2 * d for d in products(ad.instantiate_zeros(dx), x, offsets)]
     changes = [products(d, other, offsets) for d, other in ((dx, y), (dy, x)) if type(d) is not ad.Zero]
-    return out, [_sum(list(group)) for group in zip(*changes, strict=True)]
+    return out, [total(group) for group in zip(*changes, strict=True)]
 
 
 def _laplacian_jvp(primals, tangents, *, offsets):
@@ -92,7 +89,7 @@ def _laplacian_jvp(primals, tangents, *, offsets):
         changes.append(laplacian(list(map(ad.instantiate_zeros, dc)), x, offsets))
     if type(dx) is not ad.Zero:
         changes.append(laplacian(c, dx, offsets))
-    return laplacian(c, x, offsets), _sum(changes)
+    return laplacian(c, x, offsets), total(changes)
 
 
 def _products_transpose(cotangents, x, y, *, offsets):

@@ -13,13 +13,14 @@ Slots may be empty; c is 0 there, or B x is.
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._vectors import dot
+from jeuler._vectors import dot, total
 from jeuler.forces import incidence
 from jeuler.forces.hints import as_stored, kept, stored
 from jeuler.forces.laplacian import laplacian, products
@@ -27,7 +28,7 @@ from jeuler.forces.laplacian import laplacian, products
 Law = Callable[..., Array]  # (square, approach, *parameters) -> c, elementwise
 
 
-class Layout:
+class Layout(abc.ABC):
     """Where the edges lie in memory. Hashable by identity: layouts are made once a topology and cached.
 
     Attributes:
@@ -37,6 +38,7 @@ class Layout:
     particles: int
     slot_edges: tuple[np.ndarray, ...]
 
+    @abc.abstractmethod
     def central_force(
         self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
     ) -> list[Array]:
@@ -44,7 +46,6 @@ class Layout:
 
         Parameters are what `to_slots` made of them.
         """
-        raise NotImplementedError
 
     def to_slots(self, x: Array) -> list[Array] | Array:
         """A value of each edge, () or (edge,), as one array a group with 0 in empty slots, or what `by_group` takes."""
@@ -83,11 +84,13 @@ class Indexed(Layout):
         """B^T f: slots to (particle,)."""
         return incidence.accumulate_p.bind(f, *self.tables, layout=self)
 
+    @abc.abstractmethod
     def _difference(self, x: Array, *tables: Array) -> Array:
-        raise NotImplementedError
+        """B x, from these arrays of the tables."""
 
+    @abc.abstractmethod
     def _accumulate(self, f: Array, *tables: Array) -> Array:
-        raise NotImplementedError
+        """B^T f, from these arrays of the tables."""
 
 
 class Shifts(Layout):
@@ -118,8 +121,8 @@ class Shifts(Layout):
 
     def dot_differences(self, x: Sequence[Array], y: Sequence[Array]) -> list[Array]:
         """(B x).(B y), one array a group."""
-        first, *others = (products(a, b, self.offsets) for a, b in zip(x, y, strict=True))
-        return [sum(terms, start) for start, *terms in zip(first, *others, strict=True)]
+        by_component = (products(a, b, self.offsets) for a, b in zip(x, y, strict=True))
+        return [total(group) for group in zip(*by_component, strict=True)]
 
     def to_slots(self, x):
         return jnp.broadcast_to(x, self.particles + max(self.offsets)) if x.ndim == 0 else super().to_slots(x)
@@ -253,7 +256,7 @@ def take(x: Array, index: Array) -> Array:
 
 def sum_of_columns(x: Array) -> Array:
     """The sum of each row, x being (..., column, row)."""
-    return sum(x[..., column, :] for column in range(x.shape[-2]))  # type: ignore[return-value]
+    return total(x[..., column, :] for column in range(x.shape[-2]))
 
 
 def evenly_owned(edges: np.ndarray, particles: int) -> tuple[np.ndarray, np.ndarray]:
