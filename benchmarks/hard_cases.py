@@ -1,6 +1,6 @@
 """Draw docs/hard_cases.png: a stiff cloth at 200 times the explicit limit, and the gradient through a bounce.
 
-    python benchmarks/hard_cases.py
+python benchmarks/hard_cases.py
 """
 
 import dataclasses
@@ -13,10 +13,9 @@ import numpy as np
 from arguments import arguments
 
 import jeuler
-from jeuler.colliders import Plane
-from jeuler.effects import Collisions
-from jeuler.forces import PenaltyContact
-from jeuler.implicit import implicit_euler_step, linearly_implicit_euler_step
+from jeuler import Collisions, PenaltyContact
+from jeuler.contact.colliders import Plane
+from jeuler.steps.implicit import implicit_euler_step, linearly_implicit_euler_step
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))

@@ -18,10 +18,22 @@ import jax.numpy as jnp
 import numpy as np
 from arguments import arguments
 
-from jeuler import Gravity, ParticleState, Scene, simulate, symplectic_euler_step, uses
-from jeuler.effects import Cone, Emitter, FromDisc, Lifetime, OverLife, Uniform
-from jeuler.forces import LinearDrag
-from jeuler.state import empty_pool
+from jeuler import (
+    Cone,
+    Emitter,
+    FromDisc,
+    Gravity,
+    Lifetime,
+    LinearDrag,
+    OverLife,
+    ParticleState,
+    Scene,
+    Uniform,
+    simulate,
+    symplectic_euler_step,
+    uses,
+)
+from jeuler.particles.state import empty_pool
 
 ALIVE, STEPS, DT, REPEATS = 5_000, 6_000, 0.01, 5
 FORCES = (Gravity([0.0, 0.0, -9.81]), LinearDrag(0.3, air=[2.0, 0.0, 0.0]))

@@ -20,8 +20,8 @@ import matplotlib.pyplot as plt
 
 import jeuler
 from jeuler.accuracy import Compensated, work_precision
-from jeuler.extrapolation import extrapolated_euler
-from jeuler.implicit import implicit_euler_step, linearly_implicit_euler_step
+from jeuler.steps.extrapolated import extrapolated_euler
+from jeuler.steps.implicit import implicit_euler_step, linearly_implicit_euler_step
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 

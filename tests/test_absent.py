@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 
 import jeuler
-from jeuler import Gravity, ParticleState, Scene, euler_step, simulate, solve
-from jeuler.effects import Emitter, Lifetime, SpeedLimit
-from jeuler.forces import LinearDrag, Wind
+from jeuler import (
+    Emitter,
+    Gravity,
+    Lifetime,
+    LinearDrag,
+    ParticleState,
+    Scene,
+    SpeedLimit,
+    Wind,
+    euler_step,
+    simulate,
+    solve,
+)
 
 KEY = jax.random.key(0)
 POSITION = cases.STRAND_POSITION

@@ -49,12 +49,12 @@ def test_every_step_has_a_row():
     assert steps == {method.step.__name__ for method in cases.METHODS.values()}
 
 
-@pytest.mark.parametrize("room", ["forces", "effects", "colliders"])
-def test_every_force_effect_sampler_and_collider_has_a_row(room):
+@pytest.mark.parametrize("package", ["forces", "effects", "contact", "samplers"])
+def test_every_force_effect_sampler_and_collider_has_a_row(package):
     rows = [make() for make in cases.FORCES.values()] + [row.make() for row in cases.EFFECTS.values()]
-    module = importlib.import_module(f"jeuler.{room}")
+    module = importlib.import_module(f"jeuler.{package}")
     public = {name for name in jeuler.__all__ if inspect.isclass(getattr(jeuler, name)) and hasattr(module, name)}
-    public = {name for name in public if getattr(jeuler, name).__module__.startswith(f"jeuler.{room}")}
+    public = {name for name in public if getattr(jeuler, name).__module__.startswith(f"jeuler.{package}")}
     assert len(public) >= 3
     assert public <= set().union(*map(cases.kinds_in, rows))
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import strategies
 
 import jeuler
-from jeuler.colliders import Plane, Sphere
-from jeuler.effects import Collisions
+from jeuler import Collisions
+from jeuler.contact.colliders import Plane, Sphere
 
 SCENES_AT_ONCE, EXAMPLES, STEPS = 25, 12, 20
 SHAPES = {  # particles, edges, colliders, pairs that collide

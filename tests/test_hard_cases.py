@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jeuler
-from jeuler.implicit import implicit_euler_step
-from jeuler.methods import cap_cotangent
+from jeuler.steps.explicit import cap_cotangent
+from jeuler.steps.implicit import implicit_euler_step
 
 DTYPES = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 EDGES = [[0, 1], [1, 2], [0, 2]]

@@ -6,9 +6,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler import Gravity, ParticleState, QuadraticDrag, Scene, Springs, simulate
-from jeuler.declare import uses
-from jeuler.forces import LinearDrag
+from jeuler import Gravity, LinearDrag, ParticleState, QuadraticDrag, Scene, Springs, simulate
+from jeuler.particles.fields import uses
 
 DT, STEPS, KS, KD, REST, DRAG, SWIRL, FLOOR = 1e-3, 2000, 40.0, 0.3, 0.4, 0.05, 0.02, -0.6
 GRAVITY, WIND = np.array([0.0, -9.81]), np.array([1.5, 0.0])

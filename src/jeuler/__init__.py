@@ -1,38 +1,35 @@
-"""jeuler: differentiable Euler integration of springs, particles and ODEs in JAX."""
+"""jeuler: differentiable Euler integration of springs, particles and ODEs in JAX.
 
+The verbs stand here: `solve`, `simulate`, `fit`, `fit_springs`, `advise_step`, `work_precision`, `stability_limit`,
+`diagnose`. The catalogues have a namespace each: `jeuler.forces`, `jeuler.effects`, `jeuler.contact`,
+`jeuler.samplers`, `jeuler.steps`; figures are in `jeuler.plotting`, example scenes in `jeuler.scenes`.
+"""
+
+from jeuler import contact as contact
+from jeuler import effects as effects
+from jeuler import forces as forces
+from jeuler import samplers as samplers
+from jeuler import steps as steps
 from jeuler.accuracy import Compensated, StepAdvice, WorkPrecision, advise_step, work_precision
-from jeuler.adaptive import AdaptiveSolution, solve_adaptive
-from jeuler.colliders import Box, Plane, Sphere
-from jeuler.declare import uses
-from jeuler.diagnose import Diagnosis, diagnose
+from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
+from jeuler.diagnosis import Diagnosis, diagnose
 from jeuler.effects import (
-    Choice,
-    Collisions,
-    Cone,
     Death,
     DeathOnContact,
     DeathOutside,
     Emitter,
-    FromDisc,
-    FromLine,
-    FromSphere,
-    FromSurface,
     Lifetime,
-    Normal,
     OverLife,
     PrescribedMotion,
     SampledPath,
     SpeedLimit,
-    Uniform,
 )
-from jeuler.extrapolation import extrapolated_euler
-from jeuler.fitting import Fit, SpringFit, fit, fit_springs
+from jeuler.fitting import Fit, SpringFit, Trajectory, fit, fit_springs, read_trajectory
 from jeuler.forces import (
     Bending,
     Gravity,
     Gust,
     LinearDrag,
-    PenaltyContact,
     PointAttractor,
     QuadraticDrag,
     ShapeMatching,
@@ -46,18 +43,22 @@ from jeuler.forces import (
     strand_edges,
     turbulence,
 )
-from jeuler.implicit import (
+from jeuler.particles import ParticleState, Scene, empty_pool, simulate, uses
+from jeuler.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
+from jeuler.solving import AdaptiveSolution, Solution, solve, solve_adaptive
+from jeuler.steps import (
+    cap_cotangent,
+    euler_step,
+    extrapolated_euler,
+    heun_step,
     implicit_euler,
     implicit_euler_step,
     linearly_implicit_euler,
     linearly_implicit_euler_step,
+    rk4_step,
+    stability_limit,
+    symplectic_euler_step,
 )
-from jeuler.methods import cap_cotangent, euler_step, heun_step, rk4_step, symplectic_euler_step
-from jeuler.particles import Scene, simulate
-from jeuler.solve import Solution, solve
-from jeuler.stability import stability_limit
-from jeuler.state import ParticleState, empty_pool
-from jeuler.trajectory import Trajectory, read_trajectory
 
 __version__ = "0.1.0"
 

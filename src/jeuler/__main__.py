@@ -57,7 +57,7 @@ def main(argv: list[str] | None = None) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jeuler._fit_file import fit_file
+    from jeuler.commands.fit_file import fit_file
 
     try:
         fit_file(arguments, STARTED if argv is None else time.perf_counter())

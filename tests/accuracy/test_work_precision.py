@@ -14,8 +14,8 @@ import pytest
 import jeuler
 from jeuler.accuracy import Compensated, work_precision
 from jeuler.accuracy.table import EMPTY_ROW, fitted_order, mark_pareto, roundoff_floor
-from jeuler.extrapolation import extrapolated_euler
-from jeuler.implicit import linearly_implicit_euler_step
+from jeuler.steps.extrapolated import extrapolated_euler
+from jeuler.steps.implicit import linearly_implicit_euler_step
 
 matplotlib.use("Agg")
 

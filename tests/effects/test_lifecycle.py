@@ -5,9 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeuler import Gravity, ParticleState, Scene, Springs, simulate, symplectic_euler_step
-from jeuler.declare import uses
-from jeuler.effects import (
+from jeuler import (
     Choice,
     Cone,
     Death,
@@ -16,15 +14,25 @@ from jeuler.effects import (
     Emitter,
     FromLine,
     FromSphere,
+    Gravity,
     Lifetime,
+    LinearDrag,
     Normal,
     OverLife,
+    ParticleState,
+    PointAttractor,
+    Scene,
+    ShapeMatching,
     SpeedLimit,
+    Springs,
     Uniform,
+    Viscosity,
+    simulate,
+    symplectic_euler_step,
 )
 from jeuler.effects.lifecycle import first_free
-from jeuler.forces import LinearDrag, PointAttractor, ShapeMatching, Viscosity
-from jeuler.state import empty_pool
+from jeuler.particles.fields import uses
+from jeuler.particles.state import empty_pool
 
 KEY = jax.random.key(7)
 FALL = Gravity([0.0, -9.81])

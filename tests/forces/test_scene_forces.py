@@ -6,18 +6,25 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jeuler import Gravity, ParticleState, QuadraticDrag, SampledPath, Scene, Springs, rk4_step, simulate
-from jeuler.forces import (
+from jeuler import (
     Bending,
+    Gravity,
     Gust,
     LinearDrag,
+    ParticleState,
     PointAttractor,
+    QuadraticDrag,
+    SampledPath,
+    Scene,
     ShapeMatching,
+    Springs,
     StrandBending,
     StrandCore,
     Viscosity,
     Vortex,
     Wind,
+    rk4_step,
+    simulate,
     strand_edges,
     turbulence,
 )

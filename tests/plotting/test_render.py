@@ -17,8 +17,8 @@ from matplotlib import pyplot as plt
 from PIL import Image
 
 from jeuler import ParticleState, Scene, Solution, Springs
-from jeuler.colliders import Box, Plane, Sphere
-from jeuler.effects.collisions import Collisions
+from jeuler.contact.colliders import Box, Plane, Sphere
+from jeuler.contact.collisions import Collisions
 from jeuler.plotting import Camera, Look, animate, draw
 from jeuler.plotting.camera import View, new_axes
 from jeuler.plotting.render import save_picture

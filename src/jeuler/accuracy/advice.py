@@ -9,12 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jeuler import _check
-from jeuler._precision import flat
+from jeuler._core import checks
+from jeuler._core.precision import flat
 from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
 from jeuler.accuracy.search import AIM, FACTOR, Search
-from jeuler.methods import Step, VectorField, euler_step
+from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
 
@@ -104,14 +104,14 @@ def advise_step(
     Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P. Henrici, Discrete
       Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
-    y0 = _check.state("y0", y0)
-    _check.untraced("advise_step", y0, args, t0, t1, error)
-    t0, t1 = _check.interval(t0, t1)
-    _check.positive("error", error)
-    _check.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
+    y0 = checks.state("y0", y0)
+    checks.untraced("advise_step", y0, args, t0, t1, error)
+    t0, t1 = checks.interval(t0, t1)
+    checks.positive("error", error)
+    checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if max_pilot_steps is None:
         max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))
-    max_pilot_steps = _check.count("max_pilot_steps", max_pilot_steps, least=64)
+    max_pilot_steps = checks.count("max_pilot_steps", max_pilot_steps, least=64)
     search = Search(
         f,
         y0,

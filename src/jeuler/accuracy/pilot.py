@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jeuler._precision import cast, flat_rows, precision
-from jeuler.methods import Step, VectorField
-from jeuler.solve import advance_by, no_loss
+from jeuler._core.precision import cast, flat_rows, precision
+from jeuler.solving._scan import advance_by, no_loss
+from jeuler.steps.explicit import Step, VectorField
 
 PyTree = Any
 SAMPLES = 8  # states kept of a pilot run, at which its stability is looked at

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._precision import flat, flat_rows
-from jeuler.methods import VectorField
+from jeuler._core.precision import flat, flat_rows
+from jeuler.steps.explicit import VectorField
 
 PyTree = Any
 TOLERANCES = 1e-11, 1e-13  # relative and, times the size of y0, absolute; the second is the reference

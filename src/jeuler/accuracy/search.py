@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from jeuler import _tree
-from jeuler._precision import double_precision, flat
+from jeuler._core import trees
+from jeuler._core.precision import double_precision, flat
 from jeuler.accuracy.pilot import Ladder, Pilot, distance
 from jeuler.accuracy.roundoff import Rounding
-from jeuler.implicit import linearly_implicit_euler_step
-from jeuler.methods import Step, VectorField
-from jeuler.stability import Linearisation
+from jeuler.steps.explicit import Step, VectorField
+from jeuler.steps.implicit import linearly_implicit_euler_step
+from jeuler.steps.stability import Linearisation
 
 PyTree = Any
 
@@ -48,7 +48,7 @@ class Search:
         self.error, self.relative, self.compensated, self.most = error, relative, compensated, most
         self.interval = t1 - t0
         self.order = int(getattr(step, "order", 1))
-        self.dtype = np.dtype(_tree.time_dtype(y0))
+        self.dtype = np.dtype(trees.time_dtype(y0))
         with double_precision():
             self.linear = Linearisation(f, y0, args)
         self.pilot = self.runs(step, np.float64, compensated)

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _check, _tree
-from jeuler._vectors import direction
+from jeuler._core import checks, trees
+from jeuler._core.vectors import direction
 from jeuler.forces.fields import per_particle
-from jeuler.state import DEFAULTS
+from jeuler.particles.state import DEFAULTS
 
 
-@_tree.component(static=("field",))
+@trees.component(static=("field",))
 class OverLife:
     """A field that follows a curve over each particle's life: colour, opacity, size, shape, or one of your own.
 
@@ -48,7 +48,7 @@ class OverLife:
     def __post_init__(self) -> None:
         if self.field == "shape":
             object.__setattr__(self, "values", jnp.asarray(self.values, float))
-        _tree.store_as_float(self, "values", "times", "duration")
+        trees.store_as_float(self, "values", "times", "duration")
         if self.values.ndim < 1 or len(self.values) < 1:
             raise ValueError(f"OverLife.values must have shape (key, ...), got {self.values.shape}")
         if self.times is not None and self.times.shape != self.values.shape[:1]:
@@ -56,9 +56,9 @@ class OverLife:
                 f"OverLife.times must have one time for each of the {len(self.values)} values, got {self.times.shape}"
             )
         if self.times is not None:
-            _check.increasing("OverLife.times", self.times)
+            checks.increasing("OverLife.times", self.times)
         if self.duration is not None:
-            _check.positive("OverLife.duration", self.duration, "s")
+            checks.positive("OverLife.duration", self.duration, "s")
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -107,7 +107,7 @@ def along(s: Array, times: Array, values: Array, *, stepwise: bool) -> Array:
     return total
 
 
-@_tree.component()
+@trees.component()
 class SpeedLimit:
     """No particle faster than a limit; the direction is kept.
 
@@ -130,8 +130,8 @@ class SpeedLimit:
     limit: Array
 
     def __post_init__(self) -> None:
-        _tree.store_as_float(self, "limit")
-        if not _check.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
+        trees.store_as_float(self, "limit")
+        if not checks.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {self.limit.min()}")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
@@ -141,4 +141,4 @@ class SpeedLimit:
         return state.replace(velocity=slow.astype(state.velocity.dtype))
 
     def check(self, particles: int, dim: int) -> None:
-        _check.shape("SpeedLimit.limit", self.limit.shape, (), (particles,))
+        checks.shape("SpeedLimit.limit", self.limit.shape, (), (particles,))

@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jeuler import _check, _tree
-from jeuler._components import by_component
-from jeuler.effects.samplers import Uniform, as_sampler, draw, draw_named
-from jeuler.state import COUNTERS, DEFAULTS
+from jeuler._core import checks, trees
+from jeuler._core.components import by_component
+from jeuler.particles.state import COUNTERS, DEFAULTS
+from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
 
 _OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
 
 
-@_tree.component(static=("bursts", "max_births"))
+@trees.component(static=("bursts", "max_births"))
 class Emitter:
     """Births: a steady stream and bursts, into the first free slots of the pool.
 
@@ -63,27 +63,27 @@ class Emitter:
     shape: Any = None
     extra: dict[str, Any] | None = None
     bursts: tuple[tuple[float, int], ...] = ()
-    start: _tree.Parameter = 0.0
-    stop: _tree.Parameter = jnp.inf
+    start: trees.Parameter = 0.0
+    stop: trees.Parameter = jnp.inf
     max_births: int | None = None
 
     before_motion = True
     random = True
 
     def __post_init__(self) -> None:
-        _check.number("Emitter.rate", self.rate)
-        if not _check.is_traced(self.rate) and float(self.rate) < 0:
+        checks.number("Emitter.rate", self.rate)
+        if not checks.is_traced(self.rate) and float(self.rate) < 0:
             raise ValueError(f"Emitter.rate must be at least 0 births a second, got {self.rate!r}")
         if self.max_births is not None:
-            _check.count("Emitter.max_births", self.max_births, least=1)
+            checks.count("Emitter.max_births", self.max_births, least=1)
         try:
-            bursts = tuple((float(time), _check.count("number", number)) for time, number in self.bursts)
+            bursts = tuple((float(time), checks.count("number", number)) for time, number in self.bursts)
         except (TypeError, ValueError):
             raise ValueError(
                 f"Emitter.bursts must be pairs (time in s, number of births >= 0), got {self.bursts!r}"
             ) from None
         object.__setattr__(self, "bursts", bursts)
-        _tree.store_as_float(self, "rate", "start", "stop")
+        trees.store_as_float(self, "rate", "start", "stop")
         for name in ("position", "velocity", *_OPTIONAL):
             object.__setattr__(self, name, as_sampler(f"Emitter.{name}", getattr(self, name)))
         if self.extra is not None:
@@ -138,7 +138,7 @@ class Emitter:
             return by_component(into, x, newborn) if name in ("position", "velocity") else into(x, newborn)
 
         named = {"position": self.position, "velocity": self.velocity, **self.samplers}
-        dtype = _tree.time_dtype(state.position)
+        dtype = trees.time_dtype(state.position)
         values = draw_named({"moment of birth": Uniform(0.0, 1.0), **named}, key, block, dtype)
         since_step = dt * values.pop("moment of birth")
         values["position"] = values["position"] - since_step[:, None] * values["velocity"]
@@ -188,7 +188,7 @@ def first_free(alive: Array, count: int) -> tuple[Array, Array]:
     return 32 * word + bit, up_to[-1]
 
 
-@_tree.component()
+@trees.component()
 class Lifetime:
     """Ageing, and death by age.
 
@@ -216,8 +216,8 @@ class Lifetime:
 
     def __post_init__(self) -> None:
         if self.duration is not None:
-            _check.positive("Lifetime.duration", self.duration, "s")
-        _tree.store_as_float(self, "duration")
+            checks.positive("Lifetime.duration", self.duration, "s")
+        trees.store_as_float(self, "duration")
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -231,7 +231,7 @@ class Lifetime:
         )
 
 
-@_tree.component(static=("condition",))
+@trees.component(static=("condition",))
 class Death:
     """Death where a condition holds.
 
@@ -259,7 +259,7 @@ class Death:
         return state.replace(alive=state.alive & ~self.condition(t, state))
 
 
-@_tree.component()
+@trees.component()
 class DeathOutside:
     """Death by leaving a box. A particle whose position is not a number is outside.
 
@@ -286,7 +286,7 @@ class DeathOutside:
     writes = ("alive",)
 
     def __post_init__(self) -> None:
-        _tree.store_as_float(self, "low", "high")
+        trees.store_as_float(self, "low", "high")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         inside = jnp.all((state.position >= self.low) & (state.position <= self.high), axis=1)
@@ -294,10 +294,10 @@ class DeathOutside:
 
     def check(self, particles: int, dim: int) -> None:
         for name in ("low", "high"):
-            _check.shape(f"DeathOutside.{name}", getattr(self, name).shape, (), (dim,))
+            checks.shape(f"DeathOutside.{name}", getattr(self, name).shape, (), (dim,))
 
 
-@_tree.component()
+@trees.component()
 class DeathOnContact:
     """Death by touching a surface.
 
@@ -321,14 +321,14 @@ class DeathOnContact:
     """
 
     collider: Any
-    margin: _tree.Parameter = 0.0
+    margin: trees.Parameter = 0.0
 
     before_motion = True
     writes = ("alive",)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "collider", _tree.as_component(self.collider))
-        _tree.store_as_float(self, "margin")
+        object.__setattr__(self, "collider", trees.as_component(self.collider))
+        trees.store_as_float(self, "margin")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         distance = jax.vmap(self.collider, (None, 0))(t, state.position)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _check, _tree
-from jeuler._interpolate import interpolate, slopes
+from jeuler._core import checks, trees
+from jeuler._core.interpolate import interpolate, slopes
 
 
-@_tree.component()
+@trees.component()
 class SampledPath:
     """A path through samples, as a motion capture gives it: piecewise cubic, with slopes from finite differences.
 
@@ -33,24 +33,24 @@ class SampledPath:
     Source: C. de Boor, A Practical Guide to Splines, 1978, ch. IV (cubic Hermite interpolation).
     """
 
-    times: _tree.Parameter
-    positions: _tree.Parameter
+    times: trees.Parameter
+    positions: trees.Parameter
 
     def __post_init__(self) -> None:
-        _tree.store_as_float(self, "times", "positions")
+        trees.store_as_float(self, "times", "positions")
         times = self.times
         if times.ndim != 1 or len(times) < 2 or len(self.positions) != len(times):
             raise ValueError(
                 f"SampledPath.times must have shape (sample,) with two samples at least and positions (sample, ...), "
                 f"got {times.shape} and {self.positions.shape}"
             )
-        _check.increasing("SampledPath.times", times)
+        checks.increasing("SampledPath.times", times)
 
     def __call__(self, t: Any) -> Array:
         return interpolate(t, self.times, self.positions, slopes(self.times, self.positions))
 
 
-@_tree.component(static=("particles",))
+@trees.component(static=("particles",))
 class PrescribedMotion:
     """Particles that follow a given path, whatever forces act on them.
 
@@ -81,7 +81,7 @@ class PrescribedMotion:
     def __post_init__(self) -> None:
         particles = tuple(int(k) for k in np.asarray(self.particles).ravel())
         object.__setattr__(self, "particles", particles)
-        object.__setattr__(self, "path", _tree.as_component(self.path))
+        object.__setattr__(self, "path", trees.as_component(self.path))
 
     def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
         """Position and velocity with the prescribed ones put in."""
@@ -96,7 +96,7 @@ class PrescribedMotion:
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         position, velocity = self.constrain(t, state.position, state.velocity)
-        return _tree.replace(state, position=position, velocity=velocity)
+        return trees.replace(state, position=position, velocity=velocity)
 
     def _position_and_velocity(self, t: Any, dtype: Any) -> tuple[Array, Array]:
         t = jnp.asarray(t)
@@ -113,4 +113,4 @@ class PrescribedMotion:
                 f"PrescribedMotion.particles must be different indices from 0 to {particles - 1}, got {list(indices)}"
             )
         shape = jax.eval_shape(self.path, jnp.zeros(())).shape
-        _check.shape("PrescribedMotion.path(t)", shape, (len(indices), dim), meaning="(prescribed, dim)")
+        checks.shape("PrescribedMotion.path(t)", shape, (len(indices), dim), meaning="(prescribed, dim)")

@@ -1,6 +1,18 @@
 """Fitting: parameters of a simulation from what was measured, by gradient."""
 
-from jeuler.fitting.fit import Fit, fit
-from jeuler.fitting.springs import SpringFit, fit_springs
+from jeuler.fitting._fit import Fit, fit
+from jeuler.fitting._springs import SpringFit, fit_springs
+from jeuler.fitting.trajectory import Trajectory, read_trajectory
 
-__all__ = ["Fit", "SpringFit", "fit", "fit_springs"]
+__all__ = [
+    "Fit",
+    "SpringFit",
+    "Trajectory",
+    "fit",
+    "fit_springs",
+    "read_trajectory",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -41,7 +41,7 @@ class Progress:
 class LeastSquares:
     """A residual vector r(z), compiled once: its weighted mean square, gradient and Jacobian.
 
-        loss(z) = sum_k w_k r_k(z)^2 / count,   w_k = 1 for what counts, 0 for what does not count yet
+    loss(z) = sum_k w_k r_k(z)^2 / count,   w_k = 1 for what counts, 0 for what does not count yet
     """
 
     def __init__(self, residual: Callable[[Array], Array], size: int) -> None:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jeuler.particles import ParticleState, Scene
+from jeuler.particles.scene import ParticleState, Scene
 
 
 class Oscillation(NamedTuple):

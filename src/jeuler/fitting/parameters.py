@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler import _tree
-from jeuler.particles import ParticleState, Scene
+from jeuler._core import trees
+from jeuler.particles.scene import ParticleState, Scene
 
 STATE_PARAMETERS = ("mass", "velocity", "position", "anchors")
 
@@ -78,11 +78,11 @@ def put_parameters(scene: Scene, state: ParticleState, params: dict[str, Any]) -
     for name, value in params.items():
         owners, field = _owners(scene, name)
         for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
-            forces[k] = _tree.replace(forces[k], **{field: x})
+            forces[k] = trees.replace(forces[k], **{field: x})
         if not owners and name == "mass" and not value.ndim:
-            state = _tree.replace(state, mass=value)
+            state = trees.replace(state, mass=value)
         elif not owners:
             field = "position" if name == "anchors" else name
             rows = np.flatnonzero(~free if name == "anchors" else free)
-            state = _tree.replace(state, **{field: getattr(state, field).at[rows].set(value)})
-    return _tree.replace(scene, forces=tuple(forces)), state
+            state = trees.replace(state, **{field: getattr(state, field).at[rows].set(value)})
+    return trees.replace(scene, forces=tuple(forces)), state

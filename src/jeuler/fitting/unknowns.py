@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from jeuler import _check
+from jeuler._core import checks
 
 PyTree = Any
 
@@ -36,7 +36,7 @@ class Unknowns:
     @classmethod
     def of(cls, params: PyTree, positive: PyTree, scale: PyTree = None) -> Unknowns:
         """From starting values; ``positive`` and ``scale`` are trees of the structure of params or a prefix of it."""
-        params = _check.state("params", params)
+        params = checks.state("params", params)
         leaves = jax.tree_util.tree_leaves_with_path(params)
         names = tuple(
             jax.tree_util.keystr(path) + ("" if not x.ndim else str(list(map(int, np.unravel_index(k, x.shape)))))

@@ -2,7 +2,6 @@
 
 from jeuler.forces.air import Gust, Turbulence, Vortex, Wind, turbulence
 from jeuler.forces.attraction import PointAttractor
-from jeuler.forces.contact import PenaltyContact
 from jeuler.forces.drag import LinearDrag, QuadraticDrag
 from jeuler.forces.fields import Gravity
 from jeuler.forces.hair import StrandBending, StrandCore, strand_edges
@@ -15,7 +14,6 @@ __all__ = [
     "Gravity",
     "Gust",
     "LinearDrag",
-    "PenaltyContact",
     "PointAttractor",
     "QuadraticDrag",
     "ShapeMatching",
@@ -29,3 +27,7 @@ __all__ = [
     "strand_edges",
     "turbulence",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _tree
+from jeuler._core import trees
 
 
 def as_air(air: Any) -> Any:
@@ -17,8 +17,8 @@ def as_air(air: Any) -> Any:
     if air is None:
         return ()
     if isinstance(air, (tuple, list)) and all(callable(part) for part in air):
-        return tuple(_tree.as_component(part) for part in air)
-    return (_tree.as_component(air) if callable(air) else Wind(air),)
+        return tuple(trees.as_component(part) for part in air)
+    return (trees.as_component(air) if callable(air) else Wind(air),)
 
 
 def air_velocity(air: tuple, t: Any, position: Array) -> Array | float:
@@ -48,10 +48,10 @@ def check_air(name: str, air: tuple, particles: int, dim: int) -> None:
 
 def moving(x: Any) -> Any:
     """A parameter that may be a function of time, as a pytree of floating arrays."""
-    return _tree.as_component(x) if callable(x) else _tree.as_float(x)
+    return trees.as_component(x) if callable(x) else trees.as_float(x)
 
 
-@_tree.component()
+@trees.component()
 class Wind:
     """A uniform wind, steady or any function of time.
 
@@ -78,7 +78,7 @@ class Wind:
         return jnp.broadcast_to(at_time(self.velocity, t, position.dtype), position.shape)
 
 
-@_tree.component()
+@trees.component()
 class Gust:
     """A gust that comes again and again and fades between.
 
@@ -101,14 +101,14 @@ class Gust:
     period: Array
 
     def __post_init__(self) -> None:
-        _tree.store_as_float(self, "velocity", "period")
+        trees.store_as_float(self, "velocity", "period")
 
     def __call__(self, t: Any, position: Array) -> Array:
         strength = (1 - jnp.cos(2 * jnp.pi * t / self.period)) / 2
         return jnp.broadcast_to((self.velocity * strength).astype(position.dtype), position.shape)
 
 
-@_tree.component()
+@trees.component()
 class Turbulence:
     """A random wind without sources, a sum of waves that drift: eddies of one size.
 
@@ -143,7 +143,7 @@ class Turbulence:
     frequencies: Array
 
     def __post_init__(self) -> None:
-        _tree.store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
+        trees.store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype
@@ -187,7 +187,7 @@ def turbulence(
     return Turbulence(speed, size, time, *map(jnp.asarray, (waves, across, phases, frequencies)))
 
 
-@_tree.component()
+@trees.component()
 class Vortex:
     """Air that turns about an axis, with a core that turns like a solid body.
 
@@ -212,11 +212,11 @@ class Vortex:
     center: Any
     circulation: Array
     core: Array
-    axis: _tree.Parameter = (0.0, 0.0, 1.0)
+    axis: trees.Parameter = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving(self.center))
-        _tree.store_as_float(self, "circulation", "core", "axis")
+        trees.store_as_float(self, "circulation", "core", "axis")
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype

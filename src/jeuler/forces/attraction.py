@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _check, _tree
+from jeuler._core import checks, trees
 from jeuler.forces.air import at_time, moving
 from jeuler.forces.fields import mass_that_feels, per_particle
 
 
-@_tree.component(static=("power",))
+@trees.component(static=("power",))
 class PointAttractor:
     """A point that pulls every particle; with negative strength it pushes.
 
@@ -46,7 +46,7 @@ class PointAttractor:
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving(self.center))
         object.__setattr__(self, "strength", moving(self.strength))
-        _tree.store_as_float(self, "softening")
+        trees.store_as_float(self, "softening")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         d = at_time(self.center, t, position.dtype) - position
@@ -55,4 +55,4 @@ class PointAttractor:
         return per_particle(mass_that_feels(mass)) * acceleration
 
     def check(self, particles: int, dim: int) -> None:
-        _check.shape("PointAttractor.center", jax.eval_shape(at_time, self.center, jnp.zeros(())).shape, (dim,))
+        checks.shape("PointAttractor.center", jax.eval_shape(at_time, self.center, jnp.zeros(())).shape, (dim,))

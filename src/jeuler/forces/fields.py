@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _check, _tree
-from jeuler._components import stack
+from jeuler._core import checks, trees
+from jeuler._core.components import stack
 
 
 def per_particle(x: Array) -> Array:
@@ -21,7 +21,7 @@ def mass_that_feels(mass: Array) -> Array:
     return jnp.where(jnp.isfinite(mass), mass, 0)
 
 
-@_tree.component()
+@trees.component()
 class Gravity:
     """A uniform field.
 
@@ -41,10 +41,10 @@ class Gravity:
     Source: I. Newton, Philosophiae naturalis principia mathematica, 1687.
     """
 
-    acceleration: _tree.Parameter
+    acceleration: trees.Parameter
 
     def __post_init__(self) -> None:
-        _tree.store_as_float(self, "acceleration")
+        trees.store_as_float(self, "acceleration")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         weight = jnp.broadcast_to(mass_that_feels(mass), position.shape[:1])
@@ -56,4 +56,4 @@ class Gravity:
 
     def check(self, particles: int, dim: int) -> None:
         shape = self.acceleration.shape
-        _check.shape("Gravity.acceleration", shape, (dim,), meaning="one component for each of position's")
+        checks.shape("Gravity.acceleration", shape, (dim,), meaning="one component for each of position's")

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jeuler import _check, _tree
-from jeuler._vectors import direction
-from jeuler.forces.topology import Indices
+from jeuler._core import checks, trees
+from jeuler._core.vectors import direction
+from jeuler.graphs.topology import Indices
 
 
 def strand_edges(strands: Any) -> np.ndarray:
@@ -91,21 +91,21 @@ class _OnStrands:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "strands", Indices(self.strands))
-        _tree.store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
+        trees.store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
         check_strands(type(self).__name__, self.strands, self.rest_position)
 
     def among(self, alive: Array) -> Any:
         """Only strands that live as a whole."""
         here = jnp.all(alive[np.asarray(self.strands)], axis=1)
-        return _tree.replace(self, here=here.astype(self.rest_position.dtype))
+        return trees.replace(self, here=here.astype(self.rest_position.dtype))
 
     def check(self, particles: int, dim: int) -> None:
-        _check.indices(f"{type(self).__name__}.strands", self.strands, particles, "particle indices")
+        checks.indices(f"{type(self).__name__}.strands", self.strands, particles, "particle indices")
         if dim != 3:
             raise ValueError(f"{type(self).__name__} needs particles in space, dim 3, got dim {dim}")
 
 
-@_tree.component(static=("strands",))
+@trees.component(static=("strands",))
 class StrandBending(_OnStrands):
     """Bending springs of curly hair: each edge is pulled to its rest direction in the frame of the smoothed strand.
 
@@ -158,7 +158,7 @@ class StrandBending(_OnStrands):
         return give_to_ends(pull.astype(position.dtype), self.here, nodes[:, 1:], position)
 
 
-@_tree.component(static=("strands",))
+@trees.component(static=("strands",))
 class StrandCore(_OnStrands):
     """Core springs of curly hair: they keep the coils from being pulled straight, yet let them sway.
 
@@ -219,4 +219,4 @@ def check_strands(name: str, strands: Any, rest_position: Array) -> None:
         raise ValueError(
             f"{name}.strands must have shape (strand, node) with three nodes at least, got {indices.shape}"
         )
-    _check.shape(f"{name}.rest_position", rest_position.shape, (*indices.shape, 3))
+    checks.shape(f"{name}.rest_position", rest_position.shape, (*indices.shape, 3))

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler import _check, _tree
-from jeuler._vectors import direction
-from jeuler.forces.topology import Indices, Topology
+from jeuler._core import checks, trees
+from jeuler._core.vectors import direction
+from jeuler.graphs.topology import Indices, Topology
 
 
-@_tree.component(static=("edges",))
+@trees.component(static=("edges",))
 class Viscosity:
     """Friction between neighbours: each particle is dragged along by those that it is joined to.
 
@@ -40,7 +40,7 @@ class Viscosity:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
-        _tree.store_as_float(self, "coefficient")
+        trees.store_as_float(self, "coefficient")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         c = self.coefficient.astype(position.dtype)
@@ -49,12 +49,12 @@ class Viscosity:
 
     def among(self, alive: Array) -> Viscosity:
         """Only between the living."""
-        return _tree.replace(self, coefficient=only_among(alive, self.edges, self.coefficient))
+        return trees.replace(self, coefficient=only_among(alive, self.edges, self.coefficient))
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
         shape = self.coefficient.shape
-        _check.shape("Viscosity.coefficient", shape, (), (len(self.edges),), meaning="one a pair")
+        checks.shape("Viscosity.coefficient", shape, (), (len(self.edges),), meaning="one a pair")
 
 
 def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
@@ -62,7 +62,7 @@ def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
     return jnp.where(jnp.all(alive[np.asarray(groups)], axis=1), coefficient, 0)
 
 
-@_tree.component(static=("triples",))
+@trees.component(static=("triples",))
 class Bending:
     """Resistance of a rope, a hair or a cloth to bending, about each middle particle.
 
@@ -90,7 +90,7 @@ class Bending:
 
     triples: Any
     stiffness: Array
-    rest_angle: _tree.Parameter = 0.0
+    rest_angle: trees.Parameter = 0.0
 
     def __post_init__(self) -> None:
         triples = np.asarray(self.triples)
@@ -99,7 +99,7 @@ class Bending:
                 f"Bending.triples must be integers of shape (triple, 3), got {triples.dtype} {triples.shape}"
             )
         object.__setattr__(self, "triples", Indices(triples))
-        _tree.store_as_float(self, "stiffness", "rest_angle")
+        trees.store_as_float(self, "stiffness", "rest_angle")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         i, j, k = np.asarray(self.triples).T
@@ -126,13 +126,13 @@ class Bending:
 
     def among(self, alive: Array) -> Bending:
         """Only between the living."""
-        return _tree.replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
+        return trees.replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
 
     def check(self, particles: int, dim: int) -> None:
-        _check.indices("Bending.triples", self.triples, particles, "particle indices")
+        checks.indices("Bending.triples", self.triples, particles, "particle indices")
         for name in ("stiffness", "rest_angle"):
             shape = getattr(self, name).shape
-            _check.shape(f"Bending.{name}", shape, (), (len(self.triples),), meaning="one a triple")
+            checks.shape(f"Bending.{name}", shape, (), (len(self.triples),), meaning="one a triple")
 
 
 def reciprocal(length: Array) -> Array:

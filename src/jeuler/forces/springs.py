@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler import _check, _tree
-from jeuler._components import split, stack
-from jeuler._vectors import apart, direction, dot
-from jeuler.forces.hints import stored
-from jeuler.forces.layouts import Layout
-from jeuler.forces.topology import Topology
+from jeuler._core import checks, trees
+from jeuler._core.components import split, stack
+from jeuler._core.vectors import apart, direction, dot
+from jeuler._jax.materialise import stored
+from jeuler.graphs.layouts import Layout
+from jeuler.graphs.topology import Topology
 
 
 @jax.custom_jvp
@@ -56,7 +56,7 @@ def _coefficient_jvp(primals, tangents):
     return c, dot(slopes, changes)
 
 
-@_tree.component(static=("edges",))
+@trees.component(static=("edges",))
 class Springs:
     """Linear springs and dampers between pairs of particles.
 
@@ -83,13 +83,13 @@ class Springs:
     """
 
     edges: Any
-    ks: _tree.Parameter
-    kd: _tree.Parameter
-    rest_length: _tree.Parameter
+    ks: trees.Parameter
+    kd: trees.Parameter
+    rest_length: trees.Parameter
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
-        _tree.store_as_float(self, "ks", "kd", "rest_length")
+        trees.store_as_float(self, "ks", "kd", "rest_length")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
@@ -110,7 +110,7 @@ class Springs:
     def among(self, alive: Array) -> Springs:
         """Springs between the living only: a spring with a dead end has no stiffness and no damping."""
         both = jnp.all(alive[self.edges[:]], axis=1)
-        return _tree.replace(self, ks=jnp.where(both, self.ks, 0), kd=jnp.where(both, self.kd, 0))
+        return trees.replace(self, ks=jnp.where(both, self.ks, 0), kd=jnp.where(both, self.kd, 0))
 
     @staticmethod
     def _per_spring(x: Array, dtype: Any) -> Array:
@@ -120,11 +120,11 @@ class Springs:
         self.edges.check(particles)
         for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("rest_length", "m")):
             shape = getattr(self, name).shape
-            _check.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
-            _check.not_negative(f"Springs.{name}", getattr(self, name), unit)
+            checks.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
+            checks.not_negative(f"Springs.{name}", getattr(self, name), unit)
 
 
-@_tree.component(static=("edges", "layouts"))
+@trees.component(static=("edges", "layouts"))
 class PreparedSprings:
     """Springs as the kernels take them, with the parameters in the slots of each layout."""
 
@@ -151,4 +151,4 @@ class PreparedSprings:
             groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
             return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
 
-        return _tree.replace(self, ks=only_here(self.ks), kd=only_here(self.kd))
+        return trees.replace(self, ks=only_here(self.ks), kd=only_here(self.kd))

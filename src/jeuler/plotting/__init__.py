@@ -3,7 +3,7 @@
 from jeuler.plotting.accuracy import plot_work_precision
 from jeuler.plotting.camera import Camera
 from jeuler.plotting.film import animate
-from jeuler.plotting.fit import plot_fit
+from jeuler.plotting.fits import plot_fit
 from jeuler.plotting.render import Look, draw
 from jeuler.plotting.teaching import (
     error_against_dt,
@@ -28,3 +28,7 @@ __all__ = [
     "stability_regions",
     "step_sizes",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -14,9 +14,9 @@ from matplotlib import animation, colors
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
+from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View, new_axes
 from jeuler.plotting.render import Look, Picture, alive_of
-from jeuler.state import ParticleState
 
 
 def animate(

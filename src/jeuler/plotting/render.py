@@ -10,10 +10,10 @@ from matplotlib import colors
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 
-from jeuler.declare import declared
+from jeuler.particles.fields import declared
+from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View, new_axes
 from jeuler.plotting.solids import draw_colliders, in_sight, shaded
-from jeuler.state import ParticleState
 
 MARKERS = ("o", "s", "^", "D", "*")  # by state.shape
 DEFAULT_COLOR, DEFAULT_SIZE = (0.13, 0.35, 0.62), 4.0  # points, where the state has no size

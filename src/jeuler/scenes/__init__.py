@@ -7,9 +7,9 @@ They are part of the package, so that notebooks, tests and people all run the sa
 """
 
 from jeuler.scenes.bodies import cloth_on_sphere, curly_hair, jelly_on_stairs
-from jeuler.scenes.charge import charge
 from jeuler.scenes.pools import fountain, rain_on_pegs, smoke_column
 from jeuler.scenes.setup import Setup
+from jeuler.scenes.terrain import charge
 
 ALL = (fountain, smoke_column, curly_hair, cloth_on_sphere, jelly_on_stairs, charge, rain_on_pegs)
 
@@ -24,3 +24,7 @@ __all__ = [
     "rain_on_pegs",
     "smoke_column",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

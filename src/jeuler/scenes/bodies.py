@@ -8,15 +8,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler.colliders import Box, Plane, Sphere
+from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
 from jeuler.effects import PrescribedMotion
-from jeuler.effects.collisions import Collisions
 from jeuler.forces import (
     Bending,
     Gravity,
     Gust,
     LinearDrag,
-    PenaltyContact,
     ShapeMatching,
     Springs,
     StrandBending,
@@ -24,10 +22,9 @@ from jeuler.forces import (
     strand_edges,
     turbulence,
 )
-from jeuler.particles import Scene
+from jeuler.particles import ParticleState, Scene
 from jeuler.scenes.setup import Setup
 from jeuler.scenes.shapes import cube, curls, square_cloth
-from jeuler.state import ParticleState
 
 DOWN = Gravity([0.0, 0.0, -9.81])
 

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from jeuler.colliders import Plane
-from jeuler.declare import uses
-from jeuler.effects import Cone, DeathOutside, Emitter, FromDisc, FromLine, Lifetime, Normal, OverLife, Uniform
-from jeuler.effects.collisions import Collisions
+from jeuler.contact import Collisions, Plane
+from jeuler.effects import DeathOutside, Emitter, Lifetime, OverLife
 from jeuler.forces import Gravity, Gust, LinearDrag, Vortex, turbulence
-from jeuler.particles import Scene
+from jeuler.particles import Scene, empty_pool, uses
+from jeuler.samplers import Cone, FromDisc, FromLine, Normal, Uniform
 from jeuler.scenes.setup import Setup
-from jeuler.state import empty_pool
 
 
 def fountain() -> Setup:

@@ -7,10 +7,9 @@ from typing import Any
 
 import jax
 
-from jeuler.methods import symplectic_euler_step
-from jeuler.particles import Scene, simulate
-from jeuler.solve import Solution
-from jeuler.state import ParticleState
+from jeuler.particles import ParticleState, Scene, simulate
+from jeuler.solving._scan import Solution
+from jeuler.steps.explicit import symplectic_euler_step
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler import _check
-from jeuler.methods import Step, VectorField, euler_step, rk4_step
+from jeuler._core import checks
 from jeuler.plotting.accuracy import axes_or_new, label_ends
-from jeuler.solve import solve
+from jeuler.solving._scan import solve
+from jeuler.steps.explicit import Step, VectorField, euler_step, rk4_step
 
 EXACT = {"color": "0.2", "linewidth": 1.6}
 POINTS = 501  # of a curve drawn from a function
@@ -54,9 +54,9 @@ def slope_field(
 
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. I.1.
     """
-    num = _check.count("num", num, least=2)
+    num = checks.count("num", num, least=2)
     dt = (t[1] - t[0]) / 1000 if dt is None else dt
-    _check.positive("dt", dt, "s")
+    checks.positive("dt", dt, "s")
     ax = axes_or_new(ax)
     times, states = (grid.ravel() for grid in np.meshgrid(np.linspace(*t, num), np.linspace(*y, num), indexing="ij"))
     slopes = np.asarray(jax.vmap(lambda t, y: f(t, y, args))(jnp.asarray(times), jnp.asarray(states)))
@@ -120,7 +120,7 @@ def euler_polygon(
     Source: L. Euler, Institutiones calculi integralis I, 1768, sect. 650 (the method); E. Hairer, S. Norsett, G.
       Wanner, Solving Ordinary Differential Equations I, 1993, sect. I.7 (Euler polygons).
     """
-    dt = (t1 - t0) / _check.count("num_steps", num_steps, least=1)
+    dt = (t1 - t0) / checks.count("num_steps", num_steps, least=1)
     run = solve(f, float(y0), dt=dt, num_steps=num_steps, t0=t0, args=args, step=step)
     ax = axes_or_new(ax)
     x = np.linspace(t0, t1, POINTS)

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler import _check
-from jeuler._precision import precision
-from jeuler.methods import Step, VectorField, euler_step
+from jeuler._core import checks
+from jeuler._core.precision import precision
 from jeuler.plotting.accuracy import axes_or_new, label_ends
-from jeuler.solve import solve
+from jeuler.solving._scan import solve
+from jeuler.steps.explicit import Step, VectorField, euler_step
 
 
 def local_and_cumulative_error(
@@ -56,7 +56,7 @@ def local_and_cumulative_error(
 
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.3.
     """
-    dt = (t1 - t0) / _check.count("num_steps", num_steps, least=1)
+    dt = (t1 - t0) / checks.count("num_steps", num_steps, least=1)
     run = solve(f, float(y0), dt=dt, num_steps=num_steps, t0=t0, args=args, step=step)
     t = np.asarray(run.t)
     truth = jnp.asarray(exact(t))
@@ -113,7 +113,7 @@ def error_against_dt(
 
     Source: P. Henrici, Discrete Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4.
     """
-    counts = [_check.count("num_steps", n, least=1) for n in num_steps]
+    counts = [checks.count("num_steps", n, least=1) for n in num_steps]
     dts = [(t1 - t0) / n for n in counts]
     ax, labels = axes_or_new(ax), []
 

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler import _check
-from jeuler._precision import double_precision
-from jeuler.amplification import amplification
-from jeuler.methods import Step
+from jeuler._core import checks
+from jeuler._core.precision import double_precision
 from jeuler.plotting.accuracy import axes_or_new, label_ends
+from jeuler.steps.amplification import amplification
+from jeuler.steps.explicit import Step
 
 
 def stability_regions(
@@ -46,7 +46,7 @@ def stability_regions(
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.2.
     """
-    _check.positive("dt", dt, "s")
+    checks.positive("dt", dt, "s")
     ax = axes_or_new(ax, size=(6.5, 6))
     x, y = np.linspace(box[0], box[1], 241), np.linspace(box[2], box[3], 281)
     z = x[:, None] + 1j * y

@@ -1,0 +1,3 @@
+"""What the shell does: ``python -m jeuler``."""
+
+"""What the shell does: ``python -m jeuler``."""

@@ -1,0 +1,3 @@
+"""Sums over the edges of a graph, whatever they mean: knows no physics."""
+
+"""Sums over the edges of a graph, whatever they mean: knows no physics."""

@@ -1,0 +1,132 @@
+"""Particles by their indices, fixed while tracing; joined in pairs, and the two linear maps from one to the other."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler.graphs.layouts import Layout, Pairs, Rows, Shifts
+
+MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
+SHIFT_GAIN = 4  # how many slots of Shifts cost what one edge costs in Rows
+FEW = 8  # Pairs for less than one edge in so many particles,
+MANY = 500  # and for less than so many edges: a scatter of so few costs less than the many kernels of Rows
+
+
+class Indices:
+    """Particle indices, fixed while tracing: hashable and equal by content, read as an integer array."""
+
+    def __init__(self, indices: Any) -> None:
+        self.indices: np.ndarray = np.array(indices, dtype=np.int32)
+        self.indices.setflags(write=False)
+        self._key = (self.indices.shape, hashlib.sha1(self.indices.tobytes()).hexdigest())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._key == other._key
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.indices, dtype=dtype)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.indices[index]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.indices.shape
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(shape={self.shape})"
+
+
+class Topology(Indices):
+    """The edges of a scene, (spring, 2).
+
+    The signed incidence operator B takes a value at each particle to its difference along each edge e = (i, j),
+
+        (B x)_e = x_i - x_j
+
+    Its transpose sums what each edge gives to its two ends, +f at i and -f at j.
+    """
+
+    def __init__(self, edges: Any) -> None:
+        edges = np.asarray(edges) if np.size(edges) else np.zeros((0, 2), np.int32)
+        if edges.ndim != 2 or edges.shape[1] != 2:
+            raise ValueError(f"edges must have shape (spring, 2), got {edges.shape}")
+        if not np.issubdtype(edges.dtype, np.integer):
+            raise ValueError(f"edges must be integers, particle indices, got {edges.dtype}")
+        loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
+        if loops.size:
+            raise ValueError(
+                f"edges must join two different particles, got edges[{loops[0]}] = {edges[loops[0]].tolist()}"
+            )
+        if edges.min(initial=0) < 0:
+            where = int(np.argmin(edges.min(axis=1)))
+            raise ValueError(f"edges must be particle indices from 0, got edges[{where}] = {edges[where].tolist()}")
+        super().__init__(edges)
+
+    def check(self, particles: int) -> None:
+        """Every edge joins particles that exist."""
+        out_of_range = np.flatnonzero((self.indices >= particles).any(axis=1))
+        if out_of_range.size:
+            first = out_of_range[0]
+            raise ValueError(
+                f"edges must be indices below the number of particles, {particles}, "
+                f"got edges[{first}] = {self[first].tolist()}"
+            )
+
+    def layouts(self, particles: int) -> tuple[Layout, ...]:
+        """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
+
+        The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
+        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. Of
+        the others, if they are less than MANY, or less than one in FEW particles, `Pairs`, else `Rows`.
+        """
+        return _layouts(self, particles)
+
+    def difference(self, x: Array) -> Array:
+        """B x: (particle, dim) to (spring, dim)."""
+        return x[self[:, 0]] - x[self[:, 1]]
+
+    def accumulate(self, force: Array, particles: int) -> Array:
+        """B^T f: (spring, dim) to (particle, dim)."""
+        total = jnp.zeros((particles, *force.shape[1:]), force.dtype)
+        return total.at[self[:, 0]].add(force).at[self[:, 1]].add(-force)
+
+
+@functools.lru_cache(maxsize=64)
+def _layouts(topology: Topology, particles: int) -> tuple[Layout, ...]:
+    edges, numbers = topology.indices, np.arange(len(topology))
+    if not len(edges):
+        return ()
+    offset = np.abs(edges[:, 1] - edges[:, 0])
+    offsets, counts = np.unique(offset, return_counts=True)
+    worth = SHIFT_GAIN * counts > particles + offsets
+    commonest = np.argsort(-counts[worth], kind="stable")[:MOST_GROUPS]
+    regular = np.isin(offset, offsets[worth][commonest]) & _first_of_its_kind(edges)
+    others = ~regular
+    layouts: list[Layout] = []
+    if regular.any():
+        layouts.append(Shifts(edges[regular], numbers[regular], particles))
+    if others.any():
+        kind = Pairs if np.count_nonzero(others) < max(MANY, particles / FEW) else Rows
+        layouts.append(kind(edges[others], numbers[others], particles))
+    return tuple(layouts)
+
+
+def _first_of_its_kind(edges: np.ndarray) -> np.ndarray:
+    """Whether no earlier edge joins the same two particles."""
+    _, first = np.unique(np.sort(edges, axis=1), axis=0, return_index=True)
+    out = np.zeros(len(edges), bool)
+    out[first] = True
+    return out

@@ -1,0 +1,17 @@
+"""Particles, the scene of forces and effects that moves them, and the run."""
+
+from jeuler.particles.fields import uses
+from jeuler.particles.scene import Scene, simulate
+from jeuler.particles.state import ParticleState, empty_pool
+
+__all__ = [
+    "ParticleState",
+    "Scene",
+    "empty_pool",
+    "simulate",
+    "uses",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

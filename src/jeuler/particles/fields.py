@@ -1,0 +1,91 @@
+"""Which fields of the state a force or an effect reads and writes: the state is built from their union."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+from jeuler._core import trees
+from jeuler.particles.state import ParticleState, filled
+
+F = TypeVar("F", bound=Callable)
+
+
+def uses(
+    *,
+    reads: tuple[str, ...] = (),
+    writes: tuple[str, ...] = (),
+    sets: tuple[str, ...] = (),
+    before_motion: bool = False,
+) -> Callable[[F], F]:
+    """Declare the fields of a force or effect that is a plain function. Position, velocity and mass need no word.
+
+    A force gets the fields that it reads as keywords after its four arguments; an effect finds them in the state.
+
+    Args:
+      reads: fields that must be there.
+      writes: fields that an effect changes for some particles; the state gets them if it has none.
+      sets: fields that an effect gives to every particle, each step: nothing else may write them.
+      before_motion: True for births and deaths, which come before the motion of a step.
+    Returns: a decorator that gives the function back, with these as its attributes.
+    Raises: ValueError, in `simulate`, if nothing provides a field that is read, or two effects write one in conflict.
+    Example:
+      >>> import jeuler
+      >>> @jeuler.uses(reads=("temperature",))
+      ... def buoyancy(t, position, velocity, mass, temperature):
+      ...     return (temperature / 300.0 - 1.0)[:, None] * position.at[:].set([0.0, 9.81])
+      >>> buoyancy.reads
+      ('temperature',)
+
+    Source: the idea of declared reads and writes is that of entity component systems.
+    """
+
+    def decorate(function: F) -> F:
+        values = {"reads": reads, "writes": writes, "sets": sets, "before_motion": before_motion}
+        for name, value in values.items():
+            setattr(function, name, value)
+        return function
+
+    return decorate
+
+
+def declared(part: Any, what: str, default: Any = ()) -> Any:
+    """What a force or effect says of itself: the fields it ``reads``, ``writes`` or ``sets``, or another attribute."""
+    return getattr(part.function if isinstance(part, trees.Function) else part, what, default)
+
+
+def name_of(part: Any) -> str:
+    part = part.function if isinstance(part, trees.Function) else part
+    return getattr(part, "__name__", type(part).__name__)
+
+
+def completed(state: ParticleState, forces: Iterable, effects: Iterable) -> ParticleState:
+    """The state with every field that the effects write; ValueError if a field is missing or in conflict."""
+    effects = tuple(effects)
+    shapes: dict[str, tuple[int, ...]] = {}
+    for effect in effects:
+        shapes |= declared(effect, "shapes", {})
+        for field in declared(effect, "sets"):
+            for other in effects:
+                if other is not effect and field in (*declared(other, "writes"), *declared(other, "sets")):
+                    raise ValueError(
+                        f"{name_of(effect)} sets {field!r} of every particle at each step, and {name_of(other)} "
+                        f"writes it too: one of them would be lost; take one of the two out of Scene.effects"
+                    )
+    written = [name for effect in effects for name in (*declared(effect, "writes"), *declared(effect, "sets"))]
+    state = filled(state, tuple(dict.fromkeys(written)), shapes)
+    for part in (*forces, *effects):
+        for field in declared(part, "reads"):
+            if field not in state.fields():
+                raise ValueError(
+                    f"{name_of(part)} reads {field!r}, which nothing provides: add an effect that writes it"
+                    f"{_PROVIDERS.get(field, '')}, or give it with the state, state.replace({field}=...)"
+                )
+    return state
+
+
+_PROVIDERS = {
+    "age": " (Lifetime)",
+    "lifetime": " (Emitter with lifetime=...), or name a duration",
+    "alive": " (Emitter, Lifetime)",
+}

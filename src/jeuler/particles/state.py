@@ -1,0 +1,210 @@
+"""What the particles are at one time: position, velocity, mass, and only those other fields that a scene uses."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler._core import checks, trees
+from jeuler._core.components import by_component
+
+# What a particle has in a field that nothing gave a value: (shape of one particle's value, value).
+DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
+    "alive": ((), True),
+    "age": ((), 0.0),
+    "lifetime": ((), jnp.inf),
+    "color": ((3,), 0.2),
+    "opacity": ((), 1.0),
+    "size": ((), 1.0),
+    "shape": ((), 0),
+}
+COUNTERS = ("births", "missed_births")  # one number for the whole pool, int32
+
+
+@trees.component()
+class ParticleState:
+    """What the particles of a system are at one time.
+
+    Position, velocity and mass are always there. Every other field is None, and costs nothing, unless the scene or
+    the person uses it. `simulate` adds the fields that the effects of its scene write.
+
+    Args:
+      position: (particle, dim), m.
+      velocity: (particle, dim), m/s.
+      mass: () or (particle,), kg; ``inf`` pins a particle where it is.
+      alive: (particle,), boolean; None means that all are. A dead slot holds zeros in the other fields.
+      age: (particle,), s, since birth.
+      lifetime: (particle,), s, the age at which a particle dies.
+      color: (particle, 3), red, green, blue from 0 to 1.
+      opacity: (particle,), from 0 (invisible) to 1.
+      size: (particle,), m, the diameter that is drawn.
+      shape: (particle,), integer, the marker that is drawn: 0 circle, 1 square, 2 triangle, 3 diamond, 4 star.
+      births: () int32, the number of particles born since the start.
+      missed_births: () int32, the births that found no free slot.
+      extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
+    Raises: nothing; `simulate` checks it.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.zeros((3, 2)), mass=[jnp.inf, 1.0, 1.0])
+      >>> state.position.shape, state.mass.tolist(), state.color
+      ((3, 2), [inf, 1.0, 1.0], None)
+      >>> state.replace(temperature=jnp.array([20.0, 30.0, 40.0])).temperature.tolist()
+      [20.0, 30.0, 40.0]
+
+    Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 2; W. T. Reeves, Particle Systems:
+      A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.2 (attributes).
+    """
+
+    position: trees.Parameter
+    velocity: trees.Parameter
+    mass: trees.Parameter = 1.0
+    alive: trees.Parameter = None
+    age: trees.Parameter = None
+    lifetime: trees.Parameter = None
+    color: trees.Parameter = None
+    opacity: trees.Parameter = None
+    size: trees.Parameter = None
+    shape: trees.Parameter = None
+    births: trees.Parameter = None
+    missed_births: trees.Parameter = None
+    extra: dict[str, Array] | None = None
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name == "extra":
+                value = value and {name: jnp.asarray(x) for name, x in value.items()}
+                object.__setattr__(self, "extra", value or None)
+            elif value is not None and not isinstance(value, jax.Array):
+                try:
+                    object.__setattr__(self, field.name, jnp.asarray(value))
+                except (TypeError, ValueError):
+                    raise ValueError(f"ParticleState.{field.name} must be an array of numbers, got {value!r}") from None
+        if isinstance(self.mass, jax.Array) and jnp.issubdtype(self.mass.dtype, jnp.integer):
+            trees.store_as_float(self, "mass")
+
+    def __getattr__(self, name: str) -> Any:
+        extra = self.__dict__.get("extra") or {}
+        if name in extra:
+            return extra[name]
+        raise AttributeError(f"the state has no field {name!r}; it has {', '.join(self.fields())}")
+
+    def fields(self) -> tuple[str, ...]:
+        """The names of the fields that are there."""
+        own = [f.name for f in dataclasses.fields(self) if f.name != "extra" and getattr(self, f.name) is not None]
+        return (*own, *(self.extra or {}))
+
+    def replace(self, **values: Any) -> ParticleState:
+        """A state with these fields instead; a name that is not a field of its own goes to ``extra``."""
+        own = {f.name for f in dataclasses.fields(self)}
+        extra = {name: x for name, x in values.items() if name not in own}
+        if extra:
+            values = {name: x for name, x in values.items() if name in own}
+            values["extra"] = {**(self.extra or {}), **extra}
+        return trees.replace(self, **values)
+
+    def check(self) -> None:
+        """Shapes, dtypes and masses that a run can use; one ValueError that says which cannot."""
+        for name in ("position", "velocity"):
+            x = getattr(self, name)
+            if not jnp.issubdtype(x.dtype, jnp.floating):
+                raise ValueError(
+                    f"state.{name} must be floating, got {x.dtype}; convert it, jnp.asarray({name}, dtype=float)"
+                )
+        shape = self.position.shape
+        if len(shape) != 2:
+            raise ValueError(
+                f"state.position must have shape (particle, dim), got {shape}; for a batch of systems use jax.vmap"
+            )
+        if self.velocity.shape != shape:
+            raise ValueError(f"state.velocity must have the shape of position, {shape}, got {self.velocity.shape}")
+        if self.velocity.dtype != self.position.dtype:
+            raise ValueError(
+                f"state.velocity must have the dtype of position, {self.position.dtype}, got {self.velocity.dtype}"
+            )
+        checks.shape("state.mass", self.mass.shape, (), shape[:1], meaning="one a particle")
+        if not checks.is_traced(self.mass):
+            mass = np.asarray(self.mass).ravel()
+            bad = np.flatnonzero(~(mass > 0))
+            if bad.size:
+                raise ValueError(
+                    f"state.mass must be greater than 0 kg (inf pins a particle), got {mass[bad[0]]} "
+                    f"at particle {bad[0]}"
+                )
+        self._check_fields(shape[0])
+
+    def _check_fields(self, particles: int) -> None:
+        for name in self.fields():
+            shape = getattr(self, name).shape
+            if name in DEFAULTS:
+                checks.shape(f"state.{name}", shape, (particles, *DEFAULTS[name][0]))
+            if name in (self.extra or {}) and shape[:1] not in ((), (particles,)):
+                raise ValueError(f"state.{name} must have shape () or ({particles}, ...), one a particle, got {shape}")
+        if self.alive is not None and self.alive.dtype != bool:
+            raise ValueError(
+                f"state.alive must be boolean, got {self.alive.dtype}; write for example alive=(alive > 0)"
+            )
+
+
+def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -> ParticleState:
+    """A pool of free slots, all dead, for an `Emitter` to fill.
+
+    Args:
+      capacity: the number of slots, the most particles that can be alive at once, an integer >= 1.
+      dim: the dimension of space, 2 or 3 as a rule.
+      mass: mass of each particle, () or (capacity,), kg.
+      dtype: precision of position and velocity; None means JAX's default float.
+    Returns: a `ParticleState` with ``alive`` False everywhere.
+    Raises: ValueError, if the capacity or the dimension is not a positive integer.
+    Example:
+      >>> import jeuler
+      >>> pool = jeuler.empty_pool(100, dim=3)
+      >>> pool.position.shape, int(pool.alive.sum())
+      ((100, 3), 0)
+
+    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.1.
+    """
+    capacity, dim = checks.count("capacity", capacity, least=1), checks.count("dim", dim, least=1)
+    zeros = jnp.zeros((capacity, dim), dtype or float)
+    return ParticleState(zeros, zeros, mass=mass, alive=jnp.zeros(capacity, bool))
+
+
+def filled(
+    state: ParticleState, names: tuple[str, ...], shapes: dict[str, tuple[int, ...]] | None = None
+) -> ParticleState:
+    """The state with default values in those of the named fields that it lacks; mass becomes one a particle.
+
+    ``shapes``: of one particle's value, for fields of the person's own that are not one number.
+    """
+    particles, dtype = len(state.position), state.position.dtype
+    values: dict[str, Array] = {}
+    for name in names:
+        if name == "mass":
+            values[name] = jnp.broadcast_to(state.mass, (particles,))
+        elif name not in state.fields():
+            if name in COUNTERS:
+                values[name] = jnp.int32(0)
+            else:
+                shape, value = DEFAULTS.get(name, ((shapes or {}).get(name, ()), 0.0))
+                kind = {bool: bool, int: jnp.int32}.get(type(value), dtype)
+                values[name] = jnp.full((particles, *shape), value, kind)
+    return state.replace(**values) if values else state
+
+
+def parked(state: ParticleState) -> ParticleState:
+    """The state with zeros in the dead slots, whatever an effect left there; masses are kept."""
+
+    def park(x: Array) -> Array:
+        if x.shape[:1] != state.position.shape[:1]:
+            return x
+        return jnp.where(alive.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
+
+    alive = jnp.asarray(state.alive)
+    rest = jax.tree.map(park, trees.replace(state, position=None, velocity=None, mass=None))
+    position, velocity = (by_component(park, x) for x in (state.position, state.velocity))
+    return trees.replace(rest, position=position, velocity=velocity, mass=state.mass)

@@ -1,0 +1,15 @@
+"""Steps in a loop: on a fixed grid of times, of adaptive size, or undone step by step."""
+
+from jeuler.solving._adaptive import AdaptiveSolution, solve_adaptive
+from jeuler.solving._scan import Solution, solve
+
+__all__ = [
+    "AdaptiveSolution",
+    "Solution",
+    "solve",
+    "solve_adaptive",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

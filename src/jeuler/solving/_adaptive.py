@@ -1,0 +1,184 @@
+"""Steps sized by their own error estimate, in a bounded loop that has a reverse mode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jeuler._core import checks, trees
+from jeuler.steps.explicit import VectorField
+from jeuler.steps.extrapolated import ExtrapolatedStep, extrapolated_euler
+
+PyTree = Any
+
+
+@trees.component()
+class AdaptiveSolution:
+    """What an adaptive run gives back.
+
+    Attributes:
+      t: the times asked for, the initial time first, shape (saved,), s.
+      y: the states at these times: a pytree with leading axis saved.
+      num_steps: accepted steps, int32 scalar.
+      num_rejected: steps tried again with a smaller dt, int32 scalar.
+      error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of its own
+        error, before the equation damps or amplifies it.
+      finished: whether the last time was reached within max_steps; if not, the states from there on are NaN.
+    Example:
+      >>> import jeuler
+      >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=1.0, max_steps=2, dt0=0.1)
+      >>> run.t.tolist(), run.y.tolist(), int(run.num_steps), bool(run.finished)
+      ([0.0, 1.0], [1.0, nan], 2, False)
+    """
+
+    t: Array
+    y: PyTree
+    num_steps: Array
+    num_rejected: Array
+    error: PyTree
+    finished: Array
+
+
+def solve_adaptive(
+    f: VectorField,
+    y0: PyTree,
+    *,
+    t1: Any,
+    t0: Any = 0.0,
+    args: Any = None,
+    step: ExtrapolatedStep | None = None,
+    rtol: float = 1e-6,
+    atol: float = 1e-9,
+    dt0: Any = None,
+    max_steps: int = 4096,
+) -> AdaptiveSolution:
+    """Advance y' = f(t, y, args) to given times, each step sized so that its estimated error is within tolerance.
+
+        e = rms(error / (atol + rtol max(|y|, |y_next|)));   accept if e <= 1
+        dt <- dt min(5, max(0.2, 0.9 e^(-1/k))),   k the order of the step
+
+    A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
+    block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
+
+    Args:
+      f: vector field, ``f(t, y, args) -> dy/dt``.
+      y0: initial state, any pytree of floating or complex arrays. Differentiable.
+      t1: the final time, or increasing times (time,) to stop at, all > t0, s.
+      t0: initial time, s.
+      args: passed to f. Differentiable.
+      step: an `extrapolated_euler` step of order 2 or more; None takes order 6.
+      rtol: error allowed in a step, relative to the state.
+      atol: error allowed in a step, in units of the state.
+      dt0: first step to try, s; None guesses from the size of y0 and its slope.
+      max_steps: most steps between two of the times.
+    Returns: `AdaptiveSolution`.
+    Raises: ValueError, before tracing, naming the argument, what was expected and what came.
+    Example:
+      >>> import jeuler
+      >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=[1.0, 2.0])
+      >>> [round(float(y), 5) for y in run.y], bool(run.finished)
+      ([1.0, 0.36788, 0.13534], True)
+
+    Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and II.9.
+    """
+    step = extrapolated_euler(6) if step is None else step
+    if not hasattr(step, "increment_with_error") or step.order < 2:
+        raise ValueError(f"step must be an extrapolated_euler step of order 2 or more, got {step!r}")
+    y0 = checks.state("y0", y0)
+    checks.number("t0", t0)
+    max_steps = checks.count("max_steps", max_steps, least=1)
+    for name, tolerance in (("rtol", rtol), ("atol", atol)):
+        checks.number(name, tolerance)
+        if not checks.is_traced(tolerance) and float(tolerance) < 0:
+            raise ValueError(f"{name} must be at least 0, got {tolerance!r}")
+    times = jnp.atleast_1d(jnp.asarray(t1, trees.time_dtype(y0)))
+    t0 = jnp.asarray(t0, times.dtype)
+    if not checks.is_traced(times) and not checks.is_traced(t0) and not np.all(np.diff(times, prepend=t0) > 0):
+        raise ValueError(f"t1 must be later than t0={float(t0)} and increase, got {times.tolist()}")
+    checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
+    if dt0 is None:
+        dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
+    else:
+        checks.positive("dt0", dt0, "s")
+
+    def try_step(end, carry):
+        t, y, dt, error_sum, accepted, rejected, tried = carry
+        last = t + dt * (1 + 1e-3) >= end
+        h = jnp.where(last, end - t, dt)
+        increment, error = step.increment_with_error(f, t, y, h, args)
+        y_next = trees.add(y, increment)
+        ratio = lax.stop_gradient(error_ratio(error, y, y_next, rtol, atol))
+        good = ratio <= 1
+        factor = jnp.where(jnp.isfinite(ratio), 0.9 * jnp.maximum(ratio, 1e-12) ** (-1 / step.order), 0.2)
+        wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
+        shortened = good & last  # to stop at a time: no reason for a smaller dt
+        dt = jnp.where(shortened, jnp.maximum(wanted, dt), wanted)
+        take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)  # noqa: E731
+        t = jnp.where(good, jnp.where(last, end, t + h), t)
+        return (
+            t,
+            take(y_next, y),
+            dt,
+            take(trees.add(error_sum, error), error_sum),
+            accepted + good,
+            rejected + ~good,
+            tried + 1,
+        )
+
+    def to_time(carry, end):
+        carry = (*carry, jnp.int32(0))
+        going = lambda c: (c[0] < end) & (c[-1] < max_steps)  # noqa: E731
+        *carry, _ = bounded_while(going, lambda c: try_step(end, c), carry, max_steps)
+        reached = carry[0] >= end
+        kept = jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), carry[1])
+        return tuple(carry), (kept, reached)
+
+    none = jnp.int32(0)
+    start = t0, y0, jnp.asarray(dt0, times.dtype), jax.tree.map(jnp.zeros_like, y0), none, none
+    (_, _, _, error, accepted, rejected), (y, reached) = lax.scan(to_time, start, times)
+    y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, y)
+    return AdaptiveSolution(jnp.append(t0, times), y, accepted, rejected, error, reached[-1])
+
+
+def error_ratio(error: PyTree, y: PyTree, y_next: PyTree, rtol: Any, atol: Any) -> Array:
+    """rms(error / (atol + rtol max(|y|, |y_next|))); nothing wrong where both error and allowance are 0."""
+
+    def squares(e, a, b):
+        allowed = atol + rtol * jnp.maximum(jnp.abs(a), jnp.abs(b))
+        e = jnp.abs(e)
+        return jnp.sum(jnp.where(e > 0, e / jnp.where(allowed > 0, allowed, jnp.finfo(e.dtype).tiny), e) ** 2)
+
+    parts = jax.tree.leaves(jax.tree.map(squares, error, y, y_next))
+    count = sum(leaf.size for leaf in jax.tree.leaves(y))
+    return jnp.sqrt(sum(parts) / max(count, 1))
+
+
+def first_step(y: PyTree, slope: PyTree, interval: Array) -> Array:
+    """A hundredth of the time in which the slope would make the state, within the interval."""
+    norm = lambda x: jnp.sqrt(sum(jnp.sum(jnp.abs(leaf) ** 2) for leaf in jax.tree.leaves(x)))  # noqa: E731
+    size, speed = norm(y), norm(slope)
+    guess = 0.01 * jnp.where(speed > 0, size / jnp.where(speed > 0, speed, 1), interval)
+    return lax.stop_gradient(jnp.clip(guess, 1e-6 * interval, interval)).astype(interval.dtype)
+
+
+def bounded_while(going: Callable, body: Callable, carry: PyTree, most: int, width: int = 16) -> PyTree:
+    """``while going(carry): carry = body(carry)``, at most ``most`` times, with a reverse mode.
+
+    A tree of scans of ``width`` branches; a branch that begins after the end is skipped whole, and its states
+    are computed again, not kept, on the way back.
+    """
+
+    def guarded(work):
+        return lambda carry, _: (lax.cond(going(carry), work, lambda c: c, carry), None)
+
+    branch, reach = guarded(body), 1
+    while reach < most:
+        inner = branch
+        branch = guarded(jax.checkpoint(lambda c, inner=inner: lax.scan(inner, c, None, length=width)[0]))
+        reach *= width
+    return branch(carry, None)[0]

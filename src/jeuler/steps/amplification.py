@@ -1,0 +1,117 @@
+"""What one step makes of one mode of the linear equation, and the largest dt at which the mode does not grow."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler._core.precision import double_precision
+from jeuler.steps.explicit import Step
+
+ROUNDOFF = 1e-15  # |R| - 1 below this is 0
+
+
+def amplification(step: Step, z: jax.Array) -> jax.Array:
+    """|R(z)|: what one step of size 1 does to y' = z y, the complex z written as a real 2 x 2 matrix."""
+    matrix = jnp.array([[z.real, -z.imag], [z.imag, z.real]])
+    image = step(lambda t, u, a: a @ u, 0.0, jnp.array([1.0, 0.0]), 1.0, matrix)
+    return jnp.hypot(image[0], image[1])
+
+
+def pair_amplification(step: Step, stiffness: jax.Array, damping: jax.Array) -> jax.Array:
+    """Spectral radius of one step of size 1 on x'' = -k x - c x'."""
+
+    def field(t, y, args):
+        return y[1], -stiffness * y[0] - damping * y[1]
+
+    (a, c), (b, d) = (step(field, 0.0, start, 1.0, None) for start in _unit_pairs())
+    mean, determinant = (a + d) / 2, a * d - b * c
+    square = mean**2 - determinant
+    return jnp.where(square > 0, jnp.abs(mean) + jnp.sqrt(jnp.maximum(square, 0)), jnp.sqrt(jnp.abs(determinant)))
+
+
+@functools.partial(jax.jit, static_argnames="step")
+def _scalar_gain(step, unit, s):
+    return jax.vmap(jax.vmap(lambda z: amplification(step, z)))(unit[:, None] * s)
+
+
+@functools.partial(jax.jit, static_argnames="step")
+def _pair_gain(step, stiffness, damping, s):
+    gain = jax.vmap(jax.vmap(lambda k, c: pair_amplification(step, k, c)))
+    return gain(stiffness[:, None] * s**2, damping[:, None] * s)
+
+
+def _unit_pairs():
+    one, zero = jnp.float64(1.0), jnp.float64(0.0)
+    return (one, zero), (zero, one)
+
+
+@functools.lru_cache(maxsize=64)
+def treats_all_alike(step: Any) -> bool:
+    """Whether the step commutes with a linear change of variables, so that eigenvalues say all about it."""
+
+    @jax.jit
+    def image(matrix):
+        def field(t, y, args):
+            return matrix[0, 0] * y[0] + matrix[0, 1] * y[1], matrix[1, 0] * y[0] + matrix[1, 1] * y[1]
+
+        return jnp.array([step(field, 0.0, start, 1.0, None) for start in _unit_pairs()]).T
+
+    with double_precision():
+        field = np.array([[0.1, 0.7], [-0.4, -0.3]])
+        change = np.array([[1.0, 0.5], [-0.3, 0.8]])
+        other = change @ image(np.linalg.solve(change, field @ change)) @ np.linalg.inv(change)
+        return bool(np.allclose(image(field), other, rtol=1e-4, atol=1e-4))
+
+
+def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> np.ndarray:
+    """The largest stable dt of each eigenvalue, Re <= 0."""
+    size = np.abs(rates)
+    return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
+
+
+def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf) -> np.ndarray:
+    """The largest stable dt of each mode x'' = -k x - c x'."""
+    size = np.sqrt(np.abs(stiffness)) + np.abs(damping)
+    gain = functools.partial(_pair_gain, step, stiffness / size**2, damping / size)
+    return largest_stable(gain, 1 / (size * interval)) / size
+
+
+def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
+    """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if endless.
+
+    gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|,
+      (mode,).
+    """
+    points, lasting = 801, 25  # 50 a decade; above 1 over half a decade is no noise of a solve
+    modes = len(growth)
+    s = np.broadcast_to(np.logspace(-8, 8, points), (modes, points))
+
+    def excess(s):
+        above = np.asarray(gain(s)) - 1 - growth[:, None] * s
+        return np.where(np.isfinite(above), above, np.inf)
+
+    above = excess(s)
+    unstable = above > ROUNDOFF
+    lasts = np.stack([unstable[:, k : points - lasting + k] for k in range(lasting)]).all(axis=0)
+    first, ends = np.argmax(lasts, axis=1), np.any(lasts, axis=1)
+    limits = np.where(ends, 0.0, np.inf)
+    for mode in np.flatnonzero(ends & (first > 0)):
+        # growth as s^2 or s^4 is below roundoff at small s: an interval without decay counts only if long
+        decay = above[mode, : first[mode]].min()
+        if decay < -4 * ROUNDOFF or s[mode, first[mode]] > 0.05:
+            limits[mode] = s[mode, first[mode]]
+    found = (limits > 0) & np.isfinite(limits)
+    low, high = (np.where(found, s[range(modes), np.maximum(first - k, 0)], 1.0) for k in (1, 0))
+    for _ in range(3 if found.any() else 0):  # three times a grid of 801 points between the last two
+        s = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
+        unstable = excess(s) > ROUNDOFF
+        first = np.maximum(unstable.argmax(1), 1)
+        low, high = s[range(modes), first - 1], s[range(modes), first]
+    return np.where(found, low, limits)

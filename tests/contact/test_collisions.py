@@ -1,0 +1,255 @@
+"""Contact: exact values and gradients through bounces, rest, friction, thin obstacles, moving colliders."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+from jeuler import Collisions, SampledPath
+from jeuler.contact.colliders import Box, Plane, Sphere
+
+G = 9.81
+FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
+EXPLICIT_AND_SYMPLECTIC = pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.symplectic_euler_step])
+
+
+def ball(position, velocity, mass=1.0):
+    return jeuler.ParticleState(jnp.atleast_2d(jnp.asarray(position)), jnp.atleast_2d(jnp.asarray(velocity)), mass)
+
+
+def on_floor(height=0.1, speed=0.0, g=G, *, num_steps, dt=1e-3, step=jeuler.symplectic_euler_step, **contact):
+    """A ball of radius 0.1 over a floor."""
+    scene = jeuler.Scene(
+        forces=(jeuler.Gravity(jnp.array([0.0, -1.0]) * g),),
+        effects=(Collisions((FLOOR,), radius=0.1, **contact),),
+    )
+    state = jeuler.ParticleState(jnp.array([[0.0, 1.0]]) * height, jnp.array([[1.0, 0.0]]) * speed)
+    return jeuler.simulate(scene, state, dt=dt, num_steps=num_steps, step=step)
+
+
+@pytest.mark.parametrize("num_steps", [1, 7])
+def test_two_elastic_balls_and_the_gradient_of_where_the_second_ends(num_steps):
+    def end(q):
+        state = jeuler.ParticleState(q[:2, None], q[2:, None])
+        scene = jeuler.Scene(effects=(Collisions(pairs=[(0, 1)], radius=0.1, restitution=1.0),))
+        return jeuler.simulate(scene, state, dt=1 / num_steps, num_steps=num_steps).y.position[-1, 1, 0]
+
+    q = np.array([0.0, 0.52, 1.0, 0.0])
+    value, gradient = jax.jit(jax.value_and_grad(end))(q)
+    np.testing.assert_allclose(value, 1.2, rtol=1e-14)
+    np.testing.assert_allclose(gradient, [1, 0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(q), [1, 0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("num_steps", [10, 33])
+def test_ball_between_two_walls_bounces_many_times_exactly(num_steps):
+    """Unfolding the reflections gives the end: 12 bounces, two of them in some steps."""
+    walls = Collisions((Plane([0.0], [1.0]), Plane([1.0], [-1.0])), radius=0.1, restitution=1.0, max_bounces=4)
+
+    @jax.jit
+    @jax.value_and_grad
+    def end(q):
+        state = jeuler.ParticleState(q[None, :1], q[None, 1:])
+        scene = jeuler.Scene(effects=(walls,))
+        return jeuler.simulate(scene, state, dt=10 / num_steps, num_steps=num_steps).y.position[-1, 0, 0]
+
+    def unfolded(x, v):
+        u = (x - 0.1 + 10 * v) % 1.6
+        return 0.1 + min(u, 1.6 - u)
+
+    value, gradient = end(np.array([0.3, 1.0]))
+    np.testing.assert_allclose(value, unfolded(0.3, 1.0), rtol=1e-12)
+    np.testing.assert_allclose(gradient, [1, 10], rtol=1e-12)
+
+
+def test_newtons_cradle_in_one_step():
+    """Five touching balls: the first one's velocity goes to the last."""
+    position = jnp.array([[-0.5], [0.0], [0.2], [0.4], [0.6]])
+    velocity = jnp.zeros((5, 1)).at[0].set(1.0)
+    pairs = [(k, k + 1) for k in range(4)]
+    cradle = Collisions(pairs=pairs, radius=0.1, restitution=1.0, max_bounces=4)
+    state = jeuler.ParticleState(position, velocity)
+    end = jeuler.simulate(jeuler.Scene(effects=(cradle,)), state, dt=1.0, num_steps=1).y
+    np.testing.assert_allclose(end.velocity[-1, :, 0], [0, 0, 0, 0, 1], atol=1e-14)
+    np.testing.assert_allclose(end.position[-1, :, 0], [-0.2, 0, 0.2, 0.4, 1.3], atol=1e-14)
+
+
+def test_balls_keep_momentum_and_elastic_ones_energy():
+    mass = jnp.array([1.0, 2.0, 5.0])
+    state = jeuler.ParticleState(
+        jnp.array([[0.0, 0.0], [1.0, 0.05], [2.0, -0.05]]), jnp.array([[3.0, 0.0], [0.0, 0.0], [-2.0, 0.1]]), mass
+    )
+    balls = Collisions(pairs=[(0, 1), (1, 2), (0, 2)], radius=0.2, restitution=1.0)
+    run = jeuler.simulate(jeuler.Scene(effects=(balls,)), state, dt=0.05, num_steps=40).y
+    momentum = jnp.sum(mass[:, None] * run.velocity, axis=1)
+    energy = jnp.sum(mass[:, None] * run.velocity**2, axis=(1, 2))
+    assert jnp.max(jnp.abs(run.velocity[-1] - run.velocity[0])) > 1
+    np.testing.assert_allclose(momentum, jnp.broadcast_to(momentum[0], momentum.shape), atol=1e-13)
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-13)
+
+
+@EXPLICIT_AND_SYMPLECTIC
+def test_ball_at_rest_stays_at_rest_with_finite_gradients(step):
+    @jax.jit
+    def position(height, g):
+        return on_floor(height, g=g, num_steps=200, restitution=0.5, friction=0.3, step=step).y.position
+
+    rest = position(0.1, G)
+    assert jnp.max(jnp.abs(rest - rest[0])) == 0
+    gradient = jax.jit(jax.grad(lambda *q: jnp.sum(position(*q)[-1]), argnums=(0, 1)))(0.1, G)
+    assert np.isfinite(gradient).all()
+
+
+def test_ball_comes_to_rest_where_the_bounces_accumulate():
+    """e = 1/2 from 0.2 m: at rest after sqrt(2 h/g) (1 + e) / (1 - e) = 0.6 s, on the floor."""
+    run = on_floor(0.3, num_steps=1000, restitution=0.5).y
+    assert jnp.all(run.position[:, 0, 1] >= 0.1 - 1e-12)
+    assert jnp.max(jnp.abs(run.position[560:600, 0, 1] - 0.1)) > 0
+    np.testing.assert_allclose(run.position[650:, 0, 1], 0.1, atol=1e-12)
+    np.testing.assert_array_equal(run.velocity[650:], 0)
+
+
+@EXPLICIT_AND_SYMPLECTIC
+def test_elastic_bounces_keep_the_energy(step):
+    """15 bounces in 10 s at dt = 1e-3: within 0.5 %, either way."""
+    run = on_floor(0.6, num_steps=10000, restitution=1.0, step=step).y
+    energy = G * run.position[:, 0, 1] + run.velocity[:, 0, 1] ** 2 / 2
+    np.testing.assert_allclose(energy, energy[0], rtol=5e-3)
+
+
+def test_gradient_through_a_bounce_under_gravity():
+    """x(T) = r + v* (T - t*) - g (T - t*)^2 / 2 with t* = sqrt(2 h/g), v* = sqrt(2 g h): and dx/dh of it."""
+
+    @jax.jit
+    def end(height):
+        return on_floor(height, num_steps=2000, dt=3e-4, restitution=1.0).y.position[-1, 0, 1]
+
+    def exact(height):
+        fall = jnp.sqrt(2 * (height - 0.1) / G)
+        left = 0.6 - fall
+        return 0.1 + G * fall * left - G * left**2 / 2
+
+    np.testing.assert_allclose(end(0.6), exact(0.6), rtol=2e-3)
+    np.testing.assert_allclose(jax.grad(end)(0.6), jax.grad(exact)(0.6), rtol=2e-3)
+    h = 1e-6
+    np.testing.assert_allclose(jax.grad(end)(0.6), (end(0.6 + h) - end(0.6 - h)) / (2 * h), rtol=1e-7)
+
+
+def test_sliding_ball_stops_where_friction_says():
+    """v^2 / (2 mu g), and its derivative v / (mu g)."""
+
+    @jax.jit
+    def end(speed):
+        return on_floor(speed=speed, num_steps=600, friction=0.3).y.position[-1, 0, 0]
+
+    np.testing.assert_allclose(end(1.0), 1 / (2 * 0.3 * G), rtol=5e-3)
+    np.testing.assert_allclose(jax.grad(end)(1.0), 1 / (0.3 * G), rtol=5e-3)
+
+
+@EXPLICIT_AND_SYMPLECTIC
+def test_ball_holds_on_a_slope_below_the_friction_angle_and_slides_above(step):
+    def end(friction):
+        slope = Plane([0.0, 0.0], [-0.5, np.sqrt(0.75)])  # 30 degrees, tan = 0.577
+        scene = jeuler.Scene((jeuler.Gravity([0.0, -G]),), (Collisions((slope,), friction=friction),))
+        return jeuler.simulate(scene, ball([0.0, 0.0], [0.0, 0.0]), dt=1e-3, num_steps=300, step=step).y.position[-1, 0]
+
+    along = -jnp.array([np.sqrt(0.75), 0.5])
+    np.testing.assert_allclose(end(0.6), 0, atol=2e-5)  # one explicit step's slip at most
+    expected = G * (0.5 - 0.3 * np.sqrt(0.75)) * 0.3**2 / 2
+    np.testing.assert_allclose(end(0.3) @ along, expected, rtol=2e-2)
+
+
+def smooth_disc(t, point):
+    return jnp.sqrt(jnp.sum(point**2)) - 0.1
+
+
+@pytest.mark.parametrize(
+    ("collider", "end"),
+    [
+        (Box([0.0, 0.0], [0.001, 1.0]), (-0.602, 0.05)),
+        (Sphere([0.0, 0.0], 0.1), None),
+        (smooth_disc, None),
+    ],
+)
+def test_fast_thin_crossing_is_not_missed_within_a_step(collider, end):
+    """100 m/s at dt = 0.01 s: one metre a step through two millimetres."""
+    scene = jeuler.Scene(effects=(Collisions((collider,), radius=0.05, restitution=1.0),))
+    run = jeuler.simulate(scene, ball([-0.5, 0.05], [100.0, 0.0]), dt=1e-2, num_steps=1).y
+    if end is None:  # a disc of 0.15 m met at height 0.05: the normal there, and the mirrored path
+        normal = np.array([-np.sqrt(0.15**2 - 0.05**2), 0.05]) / 0.15
+        met = np.array([normal[0] * 0.15, 0.05])
+        velocity = 100 * (np.array([1.0, 0.0]) - 2 * normal[0] * normal)
+        end = met + velocity * (0.01 - (met[0] + 0.5) / 100)
+    np.testing.assert_allclose(run.position[-1, 0], end, rtol=1e-9)
+    np.testing.assert_allclose(jnp.linalg.norm(run.velocity[-1]), 100, rtol=1e-12)
+
+
+def test_inside_of_a_sphere_holds():
+    scene = jeuler.Scene(effects=(Collisions((Sphere([0.0, 0.0], 1.0, inside=True),), restitution=1.0),))
+    run = jeuler.simulate(scene, ball([0.3, 0.1], [2.0, 1.7]), dt=0.1, num_steps=200).y
+    assert jnp.max(jnp.linalg.norm(run.position[:, 0], axis=-1)) <= 1 + 1e-12
+    np.testing.assert_allclose(jnp.linalg.norm(run.velocity[:, 0], axis=-1), np.hypot(2.0, 1.7), rtol=1e-12)
+
+
+def test_moving_wall_hits_a_ball():
+    """A wall at 2 m/s meets a resting ball at x = 1: elastic, it leaves with 4 m/s and ends at 1 + 4 (T - 1/2)."""
+    wall = Plane(SampledPath([0.0, 10.0], [[0.0], [20.0]]), [1.0])
+    scene = jeuler.Scene(effects=(Collisions((wall,), restitution=1.0),))
+    run = jeuler.simulate(scene, ball([1.0], [0.0]), dt=0.3, num_steps=3).y
+    np.testing.assert_allclose(run.velocity[-1, 0, 0], 4, rtol=1e-9)
+    np.testing.assert_allclose(run.position[-1, 0, 0], 1 + 4 * 0.4, rtol=1e-9)
+
+
+def test_a_pinned_particle_is_a_wall_and_is_not_moved():
+    balls = Collisions((FLOOR,), pairs=[(0, 1)], radius=0.1, restitution=1.0)
+    state = jeuler.ParticleState([[0.0, 0.1], [1.0, 0.1]], [[0.0, 0.0], [-1.0, 0.0]], mass=[jnp.inf, 1.0])
+    run = jeuler.simulate(jeuler.Scene(effects=(balls,)), state, dt=0.5, num_steps=3).y
+    np.testing.assert_array_equal(run.position[:, 0], run.position[:1, 0].repeat(4, 0))
+    np.testing.assert_allclose(run.position[-1, 1, 0], 0.9, rtol=1e-12)
+
+
+def test_second_derivative_through_a_bounce_off_a_sphere():
+    """The deflection by a disc depends on the height of the path in a curved way."""
+    scene = jeuler.Scene(effects=(Collisions((Sphere([0.0, 0.0], 0.1),), radius=0.05, restitution=1.0),))
+
+    def end(height):
+        state = jeuler.ParticleState(jnp.stack([-0.5, height])[None], jnp.array([[100.0, 0.0]]))
+        return jeuler.simulate(scene, state, dt=1e-2, num_steps=1).y.position[-1, 0, 1]
+
+    h = 1e-5
+    value_and_slope = jax.jit(jax.value_and_grad(end))
+    (above, slope_above), (_, slope), (below, slope_below) = map(value_and_slope, (0.05 + h, 0.05, 0.05 - h))
+    np.testing.assert_allclose(slope, (above - below) / (2 * h), rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.hessian(end))(0.05), (slope_above - slope_below) / (2 * h), rtol=1e-6)
+
+
+def test_no_collisions_unless_called_for():
+    """Particles pass through each other when no pair is named."""
+    state = jeuler.ParticleState([[0.0], [1.0]], [[1.0], [-1.0]])
+    run = jeuler.simulate(jeuler.Scene(effects=(Collisions(radius=0.4),)), state, dt=0.5, num_steps=4).y
+    np.testing.assert_allclose(run.position[-1, :, 0], [2, -1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"restitution": 1.5}, "restitution must be from 0 to 1"),
+        ({"friction": -0.1}, "friction must be from 0"),
+        ({"radius": -1.0}, "radius must be from 0"),
+        ({"pairs": [(0, 0)]}, "two different particles"),
+        ({"pairs": [(0, 5)]}, "below 1"),
+        ({"pairs": [(0.0, 1.0)]}, "integers"),
+        ({"max_bounces": 0}, "max_bounces"),
+        ({"colliders": FLOOR}, "tuple"),
+        ({"colliders": (Plane([0.0], [1.0]),)}, "Plane.point must have shape"),
+        ({"colliders": (lambda t, p: p,)}, "one signed distance"),
+        ({"colliders": (3.0,)}, "a collider must be"),
+        ({"radius": [0.1, 0.2]}, "Collisions.radius must have shape"),
+    ],
+)
+def test_bad_input(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jeuler.simulate(
+            jeuler.Scene(effects=(Collisions(**arguments),)), ball([0.0, 1.0], [0.0, 0.0]), dt=0.1, num_steps=1
+        )

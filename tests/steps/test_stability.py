@@ -1,0 +1,163 @@
+"""Predicted stability limits against closed forms, and against the dt at which real runs blow up."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import leapfrog_step, oscillator
+
+import jeuler
+from jeuler.steps.extrapolated import extrapolated_euler
+from jeuler.steps.implicit import implicit_euler_step, linearly_implicit_euler_step
+from jeuler.steps.stability import DENSE, stability_limit
+
+
+def decay(t, y, rate):
+    return -rate * y
+
+
+START = jnp.array(1.0), jnp.array(0.0)
+KS = 25.0  # omega = 5 rad/s
+
+
+@pytest.mark.parametrize(
+    ("step", "damping_ratio", "expected"),
+    [
+        (jeuler.euler_step, 0.0, 0.0),
+        (jeuler.heun_step, 0.0, 0.0),
+        (jeuler.euler_step, 1e-3, 2e-3 / 5),
+        (jeuler.euler_step, 0.3, 0.6 / 5),
+        (jeuler.euler_step, 2.0, 2 / (5 * (2 + math.sqrt(3)))),
+        (jeuler.symplectic_euler_step, 0.0, 2 / 5),
+        (jeuler.symplectic_euler_step, 0.3, 2 * (math.sqrt(1 + 0.09) - 0.3) / 5),
+        (jeuler.rk4_step, 0.0, math.sqrt(8) / 5),
+        (implicit_euler_step, 0.0, math.inf),
+        (linearly_implicit_euler_step, 0.3, math.inf),
+    ],
+)
+def test_oscillator_has_the_closed_form_limit(step, damping_ratio, expected):
+    limit = stability_limit(oscillator, 0.0, START, (KS, 10 * damping_ratio), step=step)
+    assert limit == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("step", "interval"),
+    [
+        (jeuler.euler_step, 2.0),
+        (jeuler.heun_step, 2.0),
+        (jeuler.rk4_step, 2.785293563),
+        (extrapolated_euler(4), 2.785293563),
+    ],
+)
+def test_decay_has_the_real_stability_interval(step, interval):
+    assert stability_limit(decay, 0.0, 1.0, 50.0, step=step) == pytest.approx(interval / 50, rel=1e-6)
+
+
+def spring_net(kd, side=3):
+    index = np.arange(side * side).reshape(side, side)
+    edges = np.concatenate(
+        [np.stack([a.ravel(), b.ravel()], 1) for a, b in ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))]
+    )
+    position = np.stack(np.divmod(np.arange(side * side), side), axis=1).astype(float)
+    position += 0.1 * np.sin(7 * position[:, ::-1])
+    length = np.linalg.norm(position[edges[:, 0]] - position[edges[:, 1]], axis=1)
+    mass = np.where(np.arange(side * side) == 0, np.inf, 0.5)
+    scene = jeuler.Scene(forces=(jeuler.Springs(edges, ks=40.0, kd=kd, rest_length=length),))
+    return scene, (jnp.asarray(position), jnp.zeros(position.shape)), jnp.asarray(mass)
+
+
+def net_field(t, y, args):
+    scene, mass = args
+    return scene.vector_field(t, y, mass)
+
+
+def linear(matrix):
+    return lambda t, y, args: jnp.asarray(matrix) @ y
+
+
+HEAT = 30 * (np.diag(-2 * np.ones(8)) + np.diag(np.ones(7), 1) + np.diag(np.ones(7), -1))
+SPIRAL = np.array([[-1.0, 6.0], [-6.0, -1.0]])
+UNEVEN = np.linspace(0.1, 2.0, 12)  # damping that couples the modes
+
+net, rest, net_mass = spring_net(0.8)
+uneven, _, _ = spring_net(UNEVEN)
+PROBLEMS = [
+    (decay, jnp.array(1.0), 50.0, jeuler.euler_step),
+    (decay, jnp.array(1.0), 50.0, jeuler.heun_step),
+    (decay, jnp.array(1.0), 50.0, jeuler.rk4_step),
+    (oscillator, START, (KS, 3.0), jeuler.euler_step),
+    (oscillator, START, (KS, 0.0), jeuler.symplectic_euler_step),
+    (oscillator, START, (KS, 3.0), jeuler.symplectic_euler_step),
+    (oscillator, START, (KS, 0.0), jeuler.rk4_step),
+    (linear(HEAT), jnp.ones(8), None, jeuler.euler_step),
+    (linear(HEAT), jnp.ones(8), None, extrapolated_euler(3)),
+    (linear(SPIRAL), jnp.ones(2), None, jeuler.euler_step),
+    (linear(SPIRAL), jnp.ones(2), None, jeuler.heun_step),
+    (net_field, rest, (net, net_mass), jeuler.euler_step),
+    (net_field, rest, (net, net_mass), jeuler.rk4_step),
+    (net_field, rest, (net, net_mass), jeuler.symplectic_euler_step),
+    (net_field, rest, (uneven, net_mass), jeuler.symplectic_euler_step),
+]
+
+
+@pytest.mark.parametrize("number", range(len(PROBLEMS)))
+def test_runs_blow_up_within_five_percent_of_the_limit(number):
+    """A perturbation of 1e-8 of the rest state stays as small at 0.95 of the limit, and grows at 1.05 of it."""
+    f, y, args, step = PROBLEMS[number]
+    limit = stability_limit(f, 0.0, y, args, step=step)
+    leaves, tree = jax.tree.flatten(y)
+    random = np.random.default_rng(number)
+    small = jax.tree.unflatten(tree, [1e-8 * jnp.asarray(random.standard_normal(np.shape(leaf))) for leaf in leaves])
+    rest = jax.tree.map(jnp.zeros_like, y)
+    if f is net_field:  # start at rest: a net that can turn about its pin would drift away with a velocity
+        rest, small = y, (small[0], jnp.zeros_like(small[1]))
+
+    def size_after(dt):
+        start = jax.tree.map(jnp.add, rest, small)
+        run = jeuler.solve(f, start, dt=dt, num_steps=8000, args=args, step=step, save_every=8000)
+        last = jax.tree.map(lambda leaf, r: leaf[-1] - r, run.y, rest)
+        return float(max(jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(last)))
+
+    assert size_after(0.95 * limit) < 1e-5
+    assert not size_after(1.05 * limit) < 1e-3
+
+
+def test_large_systems_agree_with_all_eigenvalues():
+    n = DENSE + 88  # a chain in one dimension, by Arnoldi; its spectrum is known
+    field = lambda t, y, ks: ks * (jnp.roll(y, 1).at[0].set(0) - 2 * y + jnp.roll(y, -1).at[-1].set(0))  # noqa: E731
+    fastest = 4 * 9.0 * math.sin(n * math.pi / (2 * (n + 1))) ** 2
+    assert stability_limit(field, 0.0, jnp.ones(n), 9.0) == pytest.approx(2 / fastest, rel=1e-4)
+
+
+def test_growth_of_the_equation_is_unstable_or_left_out():
+    grow = lambda t, y, args: jnp.array([1.0, -10.0]) * y  # noqa: E731
+    assert stability_limit(grow, 0.0, jnp.ones(2)) == 0.0
+    assert stability_limit(grow, 0.0, jnp.ones(2), growing="skip") == pytest.approx(0.2)
+
+
+def test_a_system_that_only_drifts_is_stable_at_any_step():
+    drift = lambda t, y, args: (y[1], jnp.zeros(2))  # noqa: E731
+    assert stability_limit(drift, 0.0, (jnp.zeros(2), jnp.ones(2))) == math.inf
+
+
+def test_a_step_of_ones_own_and_complex_states():
+    assert stability_limit(oscillator, 0.0, START, (KS, 0.0), step=leapfrog_step) == pytest.approx(0.4, rel=1e-3)
+    spiral = lambda t, y, args: (-1 + 6j) * y  # noqa: E731
+    assert stability_limit(spiral, 0.0, 1.0 + 0j) == pytest.approx(2 / 37, rel=1e-6)
+
+
+def test_float32_data_have_the_same_limit():
+    y = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), rest)
+    expected = stability_limit(net_field, 0.0, rest, (net, net_mass))
+    assert stability_limit(net_field, 0.0, y, (net, net_mass), growing="skip") == pytest.approx(expected, rel=1e-3)
+
+
+def test_bad_input_is_told():
+    with pytest.raises(ValueError, match="outside jit"):
+        jax.jit(lambda y: stability_limit(decay, 0.0, y, 1.0))(1.0)
+    with pytest.raises(ValueError, match="must be finite"):
+        stability_limit(lambda t, y, args: jnp.sqrt(y), 0.0, 0.0)
+    with pytest.raises(ValueError, match='"unstable" or "skip"'):
+        stability_limit(decay, 0.0, 1.0, 1.0, growing="maybe")
