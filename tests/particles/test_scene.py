@@ -21,7 +21,7 @@ from cases import (
 )
 
 import jeuler
-from jeuler.particles.fields import completed
+from jeuler.particles.fields import with_required_fields
 
 RUN = {"dt": 0.01, "num_steps": 50}
 
@@ -97,7 +97,7 @@ def effect_scene(name, ks=30.0):
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_effect_keeps_structure_shapes_and_dtypes(name, dtype):
     scene, state = effect_scene(name)
-    before = completed(state(dtype), scene.forces, scene.effects)
+    before = with_required_fields(state(dtype), scene.forces, scene.effects)
     after = jax.jit(scene.effects[-1])(jnp.asarray(0.4, dtype), jnp.asarray(0.1, dtype), before, jax.random.key(0))
     assert jax.tree.structure(after) == jax.tree.structure(before)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):

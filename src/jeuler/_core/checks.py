@@ -112,7 +112,7 @@ def count(name: str, x: Any, *, least: int = 0) -> int:
     return n
 
 
-def made(expected: str, x: Any) -> None:
+def refuse_class(expected: str, x: Any) -> None:
     """x is a thing, not the class of such things; ``expected`` begins the message."""
     if isinstance(x, type):
         raise ValueError(f"{expected}, got the class {x.__name__}; make one, {x.__name__}(...)")

@@ -27,3 +27,13 @@ def stack(parts: Sequence[Array]) -> Array:
 def by_component(function: Callable[..., Array], *arrays: Array) -> Array:
     """``function`` applied to each component of arrays (particle, dim) in turn."""
     return stack([function(*parts) for parts in zip(*map(split, arrays), strict=True)])
+
+
+def per_particle(x: Array) -> Array:
+    """A parameter of shape () or (particle,), ready to multiply (particle, dim)."""
+    return x[:, None] if x.ndim else x
+
+
+def mass_that_feels(mass: Array) -> Array:
+    """The mass, and 0 for a pinned particle (mass = inf), so that no inf reaches the sum of forces."""
+    return jnp.where(jnp.isfinite(mass), mass, 0)

@@ -1,11 +1,10 @@
-"""Arithmetic on pytrees, and the one decorator that makes a component a frozen pytree."""
+"""Arithmetic on pytrees."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,87 +13,6 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 
 PyTree = Any
-Parameter = Any  # of a component: a number, list or array as passed, a floating array as kept
-T = TypeVar("T")
-
-
-@dataclass_transform(frozen_default=True)
-def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
-    """Make a class a frozen dataclass that is also a pytree.
-
-    Fields named in ``static`` are part of the structure (hashable, fixed while tracing), all others are
-    children. Unflattening does not call ``__init__``, so a ``__post_init__`` sees what a person passed and never a
-    transformation's placeholder.
-    """
-
-    def decorate(cls: type[T]) -> type[T]:
-        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-        names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]  # made one above
-        children = tuple(name for name in names if name not in static)
-        keys = tuple(jax.tree_util.GetAttrKey(name) for name in children)
-
-        def flatten(x: T):
-            return tuple(getattr(x, n) for n in children), tuple(getattr(x, n) for n in static)
-
-        def flatten_with_keys(x: T):
-            values, aux = flatten(x)
-            return tuple(zip(keys, values, strict=True)), aux
-
-        def unflatten(aux: Any, values: Any) -> T:
-            x = object.__new__(cls)
-            for name, value in zip((*children, *static), (*values, *aux), strict=True):
-                object.__setattr__(x, name, value)
-            return x
-
-        jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
-        return cls
-
-    return decorate
-
-
-def as_float(x: ArrayLike | None) -> Array | None:
-    """A parameter as a floating array; Python numbers stay weakly typed, so they follow the state's dtype."""
-    if x is None or (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact)):
-        return x
-    if isinstance(x, (bool, int, float)):
-        return jnp.asarray(float(x))
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
-
-
-def store_as_float(component: Any, *names: str) -> None:
-    """For ``__post_init__``: replace the named fields by floating arrays. None stays where it is the default."""
-    required = {field.name for field in dataclasses.fields(component) if field.default is dataclasses.MISSING}
-    for name in names:
-        value = getattr(component, name)
-        try:
-            if value is None and name in required:
-                raise TypeError
-            value = as_float(value)
-        except (TypeError, ValueError):
-            where = f"{type(component).__name__}.{name}"
-            raise ValueError(f"{where} must be a number, or an array or list of numbers, got {value!r}") from None
-        object.__setattr__(component, name, value)
-
-
-@component(static=("function",))
-class Function:
-    """A plain function in a place where a pytree is expected: all of it is static."""
-
-    function: Callable
-
-    def __call__(self, *args: Any, **fields: Any) -> Any:
-        return self.function(*args, **fields)
-
-
-def replace(component: T, **changes: Any) -> T:
-    """The component with some fields changed; ``dataclasses.replace``, as type checkers understand it."""
-    return dataclasses.replace(component, **changes)  # type: ignore[type-var]  # components are
-
-
-def as_component(x: Any) -> Any:
-    """x if it is a pytree of arrays already; a plain function is wrapped, so that no leaf is a function."""
-    return Function(x) if callable(x) and jax.tree_util.all_leaves([x]) else x
 
 
 def real_dtype(dtype: Any) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 
 from jeuler._core.precision import cast, flat_rows, precision
-from jeuler.solving._scan import advance_by, no_loss
+from jeuler.solving._scan import advance_by, no_remainder
 from jeuler.steps.explicit import Step, VectorField
 
 PyTree = Any
@@ -46,7 +46,7 @@ class Pilot:
                 state = lax.fori_loop(begin, end, one_step, state)
                 return (end, state), state[0]
 
-            start = jnp.int32(0), (y0, no_loss(y0, compensated))
+            start = jnp.int32(0), (y0, no_remainder(y0, compensated))
             return lax.scan(segment, start, ends)[1]
 
         with precision(dtype):

@@ -11,14 +11,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jeuler._core import trees
+from jeuler._core.component import replace
 from jeuler._core.files import write_atomically
 from jeuler.commands import options
 from jeuler.commands.options import EXAMPLE, Measurement
 from jeuler.fitting import SpringFit, fit_springs
 from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes
 from jeuler.forces import QuadraticDrag, Springs
-from jeuler.particles.scene import ParticleState, Scene, simulate
+from jeuler.particles._simulate import simulate
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import rk4_step
 
 DEFAULT_PICTURE = "jeuler_fit.png"
@@ -156,7 +158,7 @@ def _report(
 def _modes(found: SpringFit) -> list[Mode]:
     """Modes at the mean of the fitted motion."""
     unmoved = np.nan_to_num(np.asarray(found.predicted)).mean(axis=0)
-    return modes(found.scene, trees.replace(found.state, position=found.state.position * 0 + unmoved))
+    return modes(found.scene, replace(found.state, position=found.state.position * 0 + unmoved))
 
 
 def _parts(x: Any) -> tuple:

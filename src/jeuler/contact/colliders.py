@@ -14,7 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import as_component, component, store_as_float
+from jeuler._core.in_time import at_time
 from jeuler._core.vectors import length, unit
 
 Collider = Callable[[Any, Array], Array]
@@ -33,9 +35,9 @@ class _Shape:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if callable(value):
-                object.__setattr__(self, name, trees.as_component(value))
+                object.__setattr__(self, name, as_component(value))
             elif not isinstance(value, bool):
-                trees.store_as_float(self, name)
+                store_as_float(self, name)
 
     def check(self, dim: int) -> None:
         for name, value in vars(self).items():
@@ -55,12 +57,7 @@ class _Shape:
                 )
 
 
-def _place(x: Any, t: Any, like: Array) -> Array:
-    """A place that stands still, or where it is at time t, in the precision of the point."""
-    return (x(t) if callable(x) else x).astype(like.dtype)
-
-
-@trees.component()
+@component()
 class Plane(_Shape):
     """A half-space: solid on the side against the normal.
 
@@ -83,10 +80,10 @@ class Plane(_Shape):
     normal: Array
 
     def __call__(self, t: Any, point: Array) -> Array:
-        return (point - _place(self.point, t, point)) @ unit(self.normal.astype(point.dtype))
+        return (point - at_time(self.point, t, point.dtype)) @ unit(self.normal.astype(point.dtype))
 
 
-@trees.component(static=("inside",))
+@component(static=("inside",))
 class Sphere(_Shape):
     """A ball (in two dimensions a disc), or the wall around one.
 
@@ -111,11 +108,11 @@ class Sphere(_Shape):
     inside: bool = False
 
     def __call__(self, t: Any, point: Array) -> Array:
-        outside = length(point - _place(self.center, t, point)) - self.radius.astype(point.dtype)
+        outside = length(point - at_time(self.center, t, point.dtype)) - self.radius.astype(point.dtype)
         return -outside if self.inside else outside
 
 
-@trees.component()
+@component()
 class Box(_Shape):
     """An axis-aligned box.
 
@@ -138,7 +135,7 @@ class Box(_Shape):
     half_size: Array
 
     def __call__(self, t: Any, point: Array) -> Array:
-        q = jnp.abs(point - _place(self.center, t, point)) - self.half_size.astype(point.dtype)
+        q = jnp.abs(point - at_time(self.center, t, point.dtype)) - self.half_size.astype(point.dtype)
         deepest = jnp.max(q)
         return jnp.where(deepest > 0, length(jnp.maximum(q, 0)), deepest)
 

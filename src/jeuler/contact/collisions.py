@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, as_component, component, store_as_float
 from jeuler.contact.colliders import check_collider
 from jeuler.contact.impacts import Impacts, Path
 
 
-@trees.component(static=("pairs", "max_bounces"))
+@component(static=("pairs", "max_bounces"))
 class Collisions:
     """Contact with restitution and Coulomb friction, resolved where on its way a particle meets the surface.
 
@@ -49,9 +50,9 @@ class Collisions:
 
     colliders: tuple = ()
     pairs: tuple[tuple[int, int], ...] = ()
-    radius: trees.Parameter = 0.0
-    restitution: trees.Parameter = 0.0
-    friction: trees.Parameter = 0.0
+    radius: Parameter = 0.0
+    restitution: Parameter = 0.0
+    friction: Parameter = 0.0
     max_bounces: int = 3
 
     def __post_init__(self) -> None:
@@ -59,10 +60,10 @@ class Collisions:
             raise ValueError(
                 f"Collisions.colliders must be a tuple, got {type(self.colliders).__name__}; write (collider,)"
             )
-        object.__setattr__(self, "colliders", tuple(trees.as_component(c) for c in self.colliders))
+        object.__setattr__(self, "colliders", tuple(as_component(c) for c in self.colliders))
         object.__setattr__(self, "pairs", _pairs(self.pairs))
         checks.count("max_bounces", self.max_bounces, least=1)
-        trees.store_as_float(self, "radius", "restitution", "friction")
+        store_as_float(self, "radius", "restitution", "friction")
         for name, most in (("radius", np.inf), ("restitution", 1.0), ("friction", np.inf)):
             value = getattr(self, name)
             if not checks.is_traced(value) and not bool(jnp.all((value >= 0) & (value <= most))):

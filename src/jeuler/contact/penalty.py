@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, as_component, component, store_as_float
 from jeuler.contact.colliders import check_collider, normal_and_speed
 
 
-@trees.component()
+@component()
 class PenaltyContact:
     """A stiff one-sided spring and damper at the surface of a collider.
 
@@ -39,12 +40,12 @@ class PenaltyContact:
 
     collider: Any
     ks: Array
-    kd: trees.Parameter = 0.0
-    radius: trees.Parameter = 0.0
+    kd: Parameter = 0.0
+    radius: Parameter = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "collider", trees.as_component(self.collider))
-        trees.store_as_float(self, "ks", "kd", "radius")
+        object.__setattr__(self, "collider", as_component(self.collider))
+        store_as_float(self, "ks", "kd", "radius")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         ks, kd, radius = (x.astype(position.dtype) for x in (self.ks, self.kd, self.radius))

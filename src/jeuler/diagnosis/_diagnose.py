@@ -12,8 +12,9 @@ import numpy as np
 
 from jeuler._core import trees
 from jeuler.diagnosis.rerun import Rerun, coincident, largest, lost_particles, springs_among
-from jeuler.particles.fields import completed, name_of
-from jeuler.particles.scene import ParticleState, Scene
+from jeuler.particles.fields import name_of, with_required_fields
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, euler_step
 
 
@@ -96,7 +97,7 @@ def diagnose(
 
     Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3.
     """
-    state = completed(state, scene.forces, scene.effects)
+    state = with_required_fields(state, scene.forces, scene.effects)
     run = Rerun(scene, state, float(dt), float(t0), step, key)
     return lost_value(run, num_steps) or (lost_gradient(run, num_steps, loss) if loss else None) or Diagnosis(True)
 

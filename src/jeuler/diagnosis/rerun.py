@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._core import trees
+from jeuler._core.component import replace
 from jeuler.forces import Springs
+from jeuler.particles._simulate import simulate
 from jeuler.particles.fields import declared, name_of
-from jeuler.particles.scene import Scene, simulate
-from jeuler.particles.state import ParticleState, parked
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState, zero_dead_slots
 from jeuler.solving._scan import Solution
 from jeuler.steps.explicit import Step
 from jeuler.steps.stability import stability_limit
@@ -80,13 +81,13 @@ class Rerun:
         before, motion = state, (state.position, state.velocity)
         t = jnp.asarray(self.time(n), dt.dtype)
         x, v = self.step(scene.vector_field, t, motion, dt, scene.attributes(before))
-        state = trees.replace(before, position=x, velocity=v)
+        state = replace(before, position=x, velocity=v)
         yield name_of(self.step), state
         moved = state
         for part, state in self.effects(scene, n, before, moved, early=False):
             yield part, state
         if state.alive is not None:
-            yield "dead slots", parked(state)
+            yield "dead slots", zero_dead_slots(state)
 
     def limit(self) -> float:
         """The stability limit at the initial state; inf where it cannot be found."""

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import component, store_as_float
+from jeuler._core.components import per_particle
 from jeuler._core.vectors import direction
-from jeuler.forces.fields import per_particle
 from jeuler.particles.state import DEFAULTS
 
 
-@trees.component(static=("field",))
+@component(static=("field",))
 class OverLife:
     """A field that follows a curve over each particle's life: colour, opacity, size, shape, or one of your own.
 
@@ -48,7 +49,7 @@ class OverLife:
     def __post_init__(self) -> None:
         if self.field == "shape":
             object.__setattr__(self, "values", jnp.asarray(self.values, float))
-        trees.store_as_float(self, "values", "times", "duration")
+        store_as_float(self, "values", "times", "duration")
         if self.values.ndim < 1 or len(self.values) < 1:
             raise ValueError(f"OverLife.values must have shape (key, ...), got {self.values.shape}")
         if self.times is not None and self.times.shape != self.values.shape[:1]:
@@ -107,7 +108,7 @@ def along(s: Array, times: Array, values: Array, *, stepwise: bool) -> Array:
     return total
 
 
-@trees.component()
+@component()
 class SpeedLimit:
     """No particle faster than a limit; the direction is kept.
 
@@ -130,7 +131,7 @@ class SpeedLimit:
     limit: Array
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "limit")
+        store_as_float(self, "limit")
         if not checks.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {self.limit.min()}")
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.component import Parameter, as_component, component, store_as_float
 from jeuler._core.components import by_component
 from jeuler.particles.state import COUNTERS, DEFAULTS
 from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
@@ -17,7 +18,7 @@ from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
 _OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
 
 
-@trees.component(static=("bursts", "max_births"))
+@component(static=("bursts", "max_births"))
 class Emitter:
     """Births: a steady stream and bursts, into the first free slots of the pool.
 
@@ -63,8 +64,8 @@ class Emitter:
     shape: Any = None
     extra: dict[str, Any] | None = None
     bursts: tuple[tuple[float, int], ...] = ()
-    start: trees.Parameter = 0.0
-    stop: trees.Parameter = jnp.inf
+    start: Parameter = 0.0
+    stop: Parameter = jnp.inf
     max_births: int | None = None
 
     before_motion = True
@@ -83,7 +84,7 @@ class Emitter:
                 f"Emitter.bursts must be pairs (time in s, number of births >= 0), got {self.bursts!r}"
             ) from None
         object.__setattr__(self, "bursts", bursts)
-        trees.store_as_float(self, "rate", "start", "stop")
+        store_as_float(self, "rate", "start", "stop")
         for name in ("position", "velocity", *_OPTIONAL):
             object.__setattr__(self, name, as_sampler(f"Emitter.{name}", getattr(self, name)))
         if self.extra is not None:
@@ -188,7 +189,7 @@ def first_free(alive: Array, count: int) -> tuple[Array, Array]:
     return 32 * word + bit, up_to[-1]
 
 
-@trees.component()
+@component()
 class Lifetime:
     """Ageing, and death by age.
 
@@ -217,7 +218,7 @@ class Lifetime:
     def __post_init__(self) -> None:
         if self.duration is not None:
             checks.positive("Lifetime.duration", self.duration, "s")
-        trees.store_as_float(self, "duration")
+        store_as_float(self, "duration")
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -231,7 +232,7 @@ class Lifetime:
         )
 
 
-@trees.component(static=("condition",))
+@component(static=("condition",))
 class Death:
     """Death where a condition holds.
 
@@ -259,7 +260,7 @@ class Death:
         return state.replace(alive=state.alive & ~self.condition(t, state))
 
 
-@trees.component()
+@component()
 class DeathOutside:
     """Death by leaving a box. A particle whose position is not a number is outside.
 
@@ -286,7 +287,7 @@ class DeathOutside:
     writes = ("alive",)
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "low", "high")
+        store_as_float(self, "low", "high")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         inside = jnp.all((state.position >= self.low) & (state.position <= self.high), axis=1)
@@ -297,7 +298,7 @@ class DeathOutside:
             checks.shape(f"DeathOutside.{name}", getattr(self, name).shape, (), (dim,))
 
 
-@trees.component()
+@component()
 class DeathOnContact:
     """Death by touching a surface.
 
@@ -321,14 +322,14 @@ class DeathOnContact:
     """
 
     collider: Any
-    margin: trees.Parameter = 0.0
+    margin: Parameter = 0.0
 
     before_motion = True
     writes = ("alive",)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "collider", trees.as_component(self.collider))
-        trees.store_as_float(self, "margin")
+        object.__setattr__(self, "collider", as_component(self.collider))
+        store_as_float(self, "margin")
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         distance = jax.vmap(self.collider, (None, 0))(t, state.position)

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, as_component, component, replace, store_as_float
 from jeuler._core.interpolate import interpolate, slopes
 
 
-@trees.component()
+@component()
 class SampledPath:
     """A path through samples, as a motion capture gives it: piecewise cubic, with slopes from finite differences.
 
@@ -33,11 +34,11 @@ class SampledPath:
     Source: C. de Boor, A Practical Guide to Splines, 1978, ch. IV (cubic Hermite interpolation).
     """
 
-    times: trees.Parameter
-    positions: trees.Parameter
+    times: Parameter
+    positions: Parameter
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "times", "positions")
+        store_as_float(self, "times", "positions")
         times = self.times
         if times.ndim != 1 or len(times) < 2 or len(self.positions) != len(times):
             raise ValueError(
@@ -50,7 +51,7 @@ class SampledPath:
         return interpolate(t, self.times, self.positions, slopes(self.times, self.positions))
 
 
-@trees.component(static=("particles",))
+@component(static=("particles",))
 class PrescribedMotion:
     """Particles that follow a given path, whatever forces act on them.
 
@@ -81,7 +82,7 @@ class PrescribedMotion:
     def __post_init__(self) -> None:
         particles = tuple(int(k) for k in np.asarray(self.particles).ravel())
         object.__setattr__(self, "particles", particles)
-        object.__setattr__(self, "path", trees.as_component(self.path))
+        object.__setattr__(self, "path", as_component(self.path))
 
     def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
         """Position and velocity with the prescribed ones put in."""
@@ -96,7 +97,7 @@ class PrescribedMotion:
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         position, velocity = self.constrain(t, state.position, state.velocity)
-        return trees.replace(state, position=position, velocity=velocity)
+        return replace(state, position=position, velocity=velocity)
 
     def _position_and_velocity(self, t: Any, dtype: Any) -> tuple[Array, Array]:
         t = jnp.asarray(t)

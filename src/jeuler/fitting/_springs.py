@@ -15,7 +15,9 @@ from jeuler._core.interpolate import hermite
 from jeuler.fitting._fit import fit
 from jeuler.fitting.observations import amplitude_of, checked_observations, horizons, place_in_steps, speed_of
 from jeuler.fitting.parameters import is_positive, put_parameters, read_parameters, values_in_forces
-from jeuler.particles.scene import ParticleState, Scene, simulate
+from jeuler.particles._simulate import simulate
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, rk4_step
 
 PyTree = Any

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jeuler.particles.scene import ParticleState, Scene
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState
 
 
 class Oscillation(NamedTuple):

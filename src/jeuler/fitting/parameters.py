@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._core import trees
-from jeuler.particles.scene import ParticleState, Scene
+from jeuler._core.component import replace
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState
 
 STATE_PARAMETERS = ("mass", "velocity", "position", "anchors")
 
@@ -78,11 +79,11 @@ def put_parameters(scene: Scene, state: ParticleState, params: dict[str, Any]) -
     for name, value in params.items():
         owners, field = _owners(scene, name)
         for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
-            forces[k] = trees.replace(forces[k], **{field: x})
+            forces[k] = replace(forces[k], **{field: x})
         if not owners and name == "mass" and not value.ndim:
-            state = trees.replace(state, mass=value)
+            state = replace(state, mass=value)
         elif not owners:
             field = "position" if name == "anchors" else name
             rows = np.flatnonzero(~free if name == "anchors" else free)
-            state = trees.replace(state, **{field: getattr(state, field).at[rows].set(value)})
-    return trees.replace(scene, forces=tuple(forces)), state
+            state = replace(state, **{field: getattr(state, field).at[rows].set(value)})
+    return replace(scene, forces=tuple(forces)), state

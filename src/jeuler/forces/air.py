@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import trees
+from jeuler._core.component import Parameter, as_component, component, store_as_float
+from jeuler._core.in_time import at_time, moving
 
 
 def as_air(air: Any) -> Any:
@@ -17,18 +18,13 @@ def as_air(air: Any) -> Any:
     if air is None:
         return ()
     if isinstance(air, (tuple, list)) and all(callable(part) for part in air):
-        return tuple(trees.as_component(part) for part in air)
-    return (trees.as_component(air) if callable(air) else Wind(air),)
+        return tuple(as_component(part) for part in air)
+    return (as_component(air) if callable(air) else Wind(air),)
 
 
 def air_velocity(air: tuple, t: Any, position: Array) -> Array | float:
     """The sum of the fields at each particle; 0 where there is none."""
     return sum((part(t, position) for part in air), start=0.0)
-
-
-def at_time(x: Any, t: Any, dtype: Any = None) -> Array:
-    """A place or strength that may be a function of time."""
-    return jnp.asarray(x(t) if callable(x) else x, dtype)
 
 
 def check_air(name: str, air: tuple, particles: int, dim: int) -> None:
@@ -46,12 +42,7 @@ def check_air(name: str, air: tuple, particles: int, dim: int) -> None:
             )
 
 
-def moving(x: Any) -> Any:
-    """A parameter that may be a function of time, as a pytree of floating arrays."""
-    return trees.as_component(x) if callable(x) else trees.as_float(x)
-
-
-@trees.component()
+@component()
 class Wind:
     """A uniform wind, steady or any function of time.
 
@@ -78,7 +69,7 @@ class Wind:
         return jnp.broadcast_to(at_time(self.velocity, t, position.dtype), position.shape)
 
 
-@trees.component()
+@component()
 class Gust:
     """A gust that comes again and again and fades between.
 
@@ -101,14 +92,14 @@ class Gust:
     period: Array
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "velocity", "period")
+        store_as_float(self, "velocity", "period")
 
     def __call__(self, t: Any, position: Array) -> Array:
         strength = (1 - jnp.cos(2 * jnp.pi * t / self.period)) / 2
         return jnp.broadcast_to((self.velocity * strength).astype(position.dtype), position.shape)
 
 
-@trees.component()
+@component()
 class Turbulence:
     """A random wind without sources, a sum of waves that drift: eddies of one size.
 
@@ -143,7 +134,7 @@ class Turbulence:
     frequencies: Array
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
+        store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype
@@ -187,7 +178,7 @@ def turbulence(
     return Turbulence(speed, size, time, *map(jnp.asarray, (waves, across, phases, frequencies)))
 
 
-@trees.component()
+@component()
 class Vortex:
     """Air that turns about an axis, with a core that turns like a solid body.
 
@@ -212,11 +203,11 @@ class Vortex:
     center: Any
     circulation: Array
     core: Array
-    axis: trees.Parameter = (0.0, 0.0, 1.0)
+    axis: Parameter = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving(self.center))
-        trees.store_as_float(self, "circulation", "core", "axis")
+        store_as_float(self, "circulation", "core", "axis")
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler._core import checks, trees
-from jeuler.forces.air import at_time, moving
-from jeuler.forces.fields import mass_that_feels, per_particle
+from jeuler._core import checks
+from jeuler._core.component import component, store_as_float
+from jeuler._core.components import mass_that_feels, per_particle
+from jeuler._core.in_time import at_time, moving
 
 
-@trees.component(static=("power",))
+@component(static=("power",))
 class PointAttractor:
     """A point that pulls every particle; with negative strength it pushes.
 
@@ -46,7 +47,7 @@ class PointAttractor:
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving(self.center))
         object.__setattr__(self, "strength", moving(self.strength))
-        trees.store_as_float(self, "softening")
+        store_as_float(self, "softening")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         d = at_time(self.center, t, position.dtype) - position

@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, replace, store_as_float
 from jeuler._core.components import by_component, split, stack
 from jeuler.forces.air import air_velocity, as_air, check_air
 
@@ -27,7 +28,7 @@ def unless_too_long(rate: Array, dt: Array) -> Array:
     return jnp.where(too_long, 1 / jnp.where(too_long, steps, 1), 1)
 
 
-@trees.component()
+@component()
 class LinearDrag:
     """Drag in proportion to the speed relative to the air (Stokes drag).
 
@@ -57,7 +58,7 @@ class LinearDrag:
     longest_step: Array | None = None
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "coefficient")
+        store_as_float(self, "coefficient")
         object.__setattr__(self, "air", as_air(self.air))
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
@@ -67,14 +68,14 @@ class LinearDrag:
         return by_component(lambda u: -c * u, through_air(self.air, t, position, velocity))
 
     def for_step(self, dt: Array) -> LinearDrag:
-        return trees.replace(self, longest_step=dt)
+        return replace(self, longest_step=dt)
 
     def check(self, particles: int, dim: int) -> None:
         check_coefficient("LinearDrag", self.coefficient, particles)
         check_air("LinearDrag", self.air, particles, dim)
 
 
-@trees.component()
+@component()
 class QuadraticDrag:
     """Drag in proportion to the square of the speed relative to the air.
 
@@ -99,12 +100,12 @@ class QuadraticDrag:
     Source: Lord Rayleigh, On the resistance of fluids, 1876.
     """
 
-    coefficient: trees.Parameter
+    coefficient: Parameter
     air: Any = None
-    longest_step: trees.Parameter = None
+    longest_step: Parameter = None
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "coefficient")
+        store_as_float(self, "coefficient")
         object.__setattr__(self, "air", as_air(self.air))
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
@@ -118,7 +119,7 @@ class QuadraticDrag:
         return stack([-c * speed * u for u in relative])  # of one split, or gradients would be (particle, dim)
 
     def for_step(self, dt: Array) -> QuadraticDrag:
-        return trees.replace(self, longest_step=dt)
+        return replace(self, longest_step=dt)
 
     def check(self, particles: int, dim: int) -> None:
         check_coefficient("QuadraticDrag", self.coefficient, particles)

@@ -7,21 +7,12 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler._core import checks, trees
-from jeuler._core.components import stack
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, store_as_float
+from jeuler._core.components import mass_that_feels, stack
 
 
-def per_particle(x: Array) -> Array:
-    """A parameter of shape () or (particle,), ready to multiply (particle, dim)."""
-    return x[:, None] if x.ndim else x
-
-
-def mass_that_feels(mass: Array) -> Array:
-    """The mass, and 0 for a pinned particle (mass = inf), so that no inf reaches the sum of forces."""
-    return jnp.where(jnp.isfinite(mass), mass, 0)
-
-
-@trees.component()
+@component()
 class Gravity:
     """A uniform field.
 
@@ -41,10 +32,10 @@ class Gravity:
     Source: I. Newton, Philosophiae naturalis principia mathematica, 1687.
     """
 
-    acceleration: trees.Parameter
+    acceleration: Parameter
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "acceleration")
+        store_as_float(self, "acceleration")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         weight = jnp.broadcast_to(mass_that_feels(mass), position.shape[:1])

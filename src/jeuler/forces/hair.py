@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import component, replace, store_as_float
+from jeuler._core.indices import Indices
 from jeuler._core.vectors import direction
-from jeuler.graphs.topology import Indices
 
 
 def strand_edges(strands: Any) -> np.ndarray:
@@ -91,13 +92,13 @@ class _OnStrands:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "strands", Indices(self.strands))
-        trees.store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
+        store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
         check_strands(type(self).__name__, self.strands, self.rest_position)
 
     def among(self, alive: Array) -> Any:
         """Only strands that live as a whole."""
         here = jnp.all(alive[np.asarray(self.strands)], axis=1)
-        return trees.replace(self, here=here.astype(self.rest_position.dtype))
+        return replace(self, here=here.astype(self.rest_position.dtype))
 
     def check(self, particles: int, dim: int) -> None:
         checks.indices(f"{type(self).__name__}.strands", self.strands, particles, "particle indices")
@@ -105,7 +106,7 @@ class _OnStrands:
             raise ValueError(f"{type(self).__name__} needs particles in space, dim 3, got dim {dim}")
 
 
-@trees.component(static=("strands",))
+@component(static=("strands",))
 class StrandBending(_OnStrands):
     """Bending springs of curly hair: each edge is pulled to its rest direction in the frame of the smoothed strand.
 
@@ -158,7 +159,7 @@ class StrandBending(_OnStrands):
         return give_to_ends(pull.astype(position.dtype), self.here, nodes[:, 1:], position)
 
 
-@trees.component(static=("strands",))
+@component(static=("strands",))
 class StrandCore(_OnStrands):
     """Core springs of curly hair: they keep the coils from being pulled straight, yet let them sway.
 

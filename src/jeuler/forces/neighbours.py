@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.indices import Indices
 from jeuler._core.vectors import direction
-from jeuler.graphs.topology import Indices, Topology
+from jeuler.graphs.topology import Topology
 
 
-@trees.component(static=("edges",))
+@component(static=("edges",))
 class Viscosity:
     """Friction between neighbours: each particle is dragged along by those that it is joined to.
 
@@ -40,7 +42,7 @@ class Viscosity:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
-        trees.store_as_float(self, "coefficient")
+        store_as_float(self, "coefficient")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         c = self.coefficient.astype(position.dtype)
@@ -49,7 +51,7 @@ class Viscosity:
 
     def among(self, alive: Array) -> Viscosity:
         """Only between the living."""
-        return trees.replace(self, coefficient=only_among(alive, self.edges, self.coefficient))
+        return replace(self, coefficient=only_among(alive, self.edges, self.coefficient))
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
@@ -62,7 +64,7 @@ def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
     return jnp.where(jnp.all(alive[np.asarray(groups)], axis=1), coefficient, 0)
 
 
-@trees.component(static=("triples",))
+@component(static=("triples",))
 class Bending:
     """Resistance of a rope, a hair or a cloth to bending, about each middle particle.
 
@@ -90,7 +92,7 @@ class Bending:
 
     triples: Any
     stiffness: Array
-    rest_angle: trees.Parameter = 0.0
+    rest_angle: Parameter = 0.0
 
     def __post_init__(self) -> None:
         triples = np.asarray(self.triples)
@@ -99,7 +101,7 @@ class Bending:
                 f"Bending.triples must be integers of shape (triple, 3), got {triples.dtype} {triples.shape}"
             )
         object.__setattr__(self, "triples", Indices(triples))
-        trees.store_as_float(self, "stiffness", "rest_angle")
+        store_as_float(self, "stiffness", "rest_angle")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         i, j, k = np.asarray(self.triples).T
@@ -126,7 +128,7 @@ class Bending:
 
     def among(self, alive: Array) -> Bending:
         """Only between the living."""
-        return trees.replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
+        return replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
 
     def check(self, particles: int, dim: int) -> None:
         checks.indices("Bending.triples", self.triples, particles, "particle indices")

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
-from jeuler.graphs.topology import Indices
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.indices import Indices
 
 
 @jax.custom_jvp
@@ -40,7 +41,7 @@ def turning(s: Array, skew: Array) -> Array:
     return jnp.linalg.solve(both_sides, skew.reshape(-1)).reshape(s.shape)
 
 
-@trees.component(static=("particles",))
+@component(static=("particles",))
 class ShapeMatching:
     """A soft body: each particle is pulled to its place in the rest shape, moved and turned as the body is now.
 
@@ -72,12 +73,12 @@ class ShapeMatching:
     particles: Any
     rest_position: Array
     stiffness: Array
-    damping: trees.Parameter = 0.0
+    damping: Parameter = 0.0
     here: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "particles", Indices(np.asarray(self.particles).reshape(-1)))
-        trees.store_as_float(self, "rest_position", "stiffness", "damping")
+        store_as_float(self, "rest_position", "stiffness", "damping")
         if self.rest_position.ndim != 2 or len(self.rest_position) != len(self.particles):
             raise ValueError(
                 f"ShapeMatching.rest_position must have shape ({len(self.particles)}, dim), one place for each of the "
@@ -100,7 +101,7 @@ class ShapeMatching:
 
     def among(self, alive: Array) -> ShapeMatching:
         """The body of the living only."""
-        return trees.replace(self, here=alive[np.asarray(self.particles)].astype(self.rest_position.dtype))
+        return replace(self, here=alive[np.asarray(self.particles)].astype(self.rest_position.dtype))
 
     def check(self, particles: int, dim: int) -> None:
         checks.indices("ShapeMatching.particles", self.particles, particles, "particle indices")

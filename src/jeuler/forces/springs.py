@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, replace, store_as_float
 from jeuler._core.components import split, stack
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
@@ -56,7 +57,7 @@ def _coefficient_jvp(primals, tangents):
     return c, dot(slopes, changes)
 
 
-@trees.component(static=("edges",))
+@component(static=("edges",))
 class Springs:
     """Linear springs and dampers between pairs of particles.
 
@@ -83,13 +84,13 @@ class Springs:
     """
 
     edges: Any
-    ks: trees.Parameter
-    kd: trees.Parameter
-    rest_length: trees.Parameter
+    ks: Parameter
+    kd: Parameter
+    rest_length: Parameter
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
-        trees.store_as_float(self, "ks", "kd", "rest_length")
+        store_as_float(self, "ks", "kd", "rest_length")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
@@ -110,7 +111,7 @@ class Springs:
     def among(self, alive: Array) -> Springs:
         """Springs between the living only: a spring with a dead end has no stiffness and no damping."""
         both = jnp.all(alive[self.edges[:]], axis=1)
-        return trees.replace(self, ks=jnp.where(both, self.ks, 0), kd=jnp.where(both, self.kd, 0))
+        return replace(self, ks=jnp.where(both, self.ks, 0), kd=jnp.where(both, self.kd, 0))
 
     @staticmethod
     def _per_spring(x: Array, dtype: Any) -> Array:
@@ -124,7 +125,7 @@ class Springs:
             checks.not_negative(f"Springs.{name}", getattr(self, name), unit)
 
 
-@trees.component(static=("edges", "layouts"))
+@component(static=("edges", "layouts"))
 class PreparedSprings:
     """Springs as the kernels take them, with the parameters in the slots of each layout."""
 
@@ -151,4 +152,4 @@ class PreparedSprings:
             groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
             return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
 
-        return trees.replace(self, ks=only_here(self.ks), kd=only_here(self.kd))
+        return replace(self, ks=only_here(self.ks), kd=only_here(self.kd))

@@ -3,50 +3,19 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jeuler._core.indices import Indices
 from jeuler.graphs.layouts import Layout, Pairs, Rows, Shifts
 
 MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
 SHIFT_GAIN = 4  # how many slots of Shifts cost what one edge costs in Rows
 FEW = 8  # Pairs for less than one edge in so many particles,
 MANY = 500  # and for less than so many edges: a scatter of so few costs less than the many kernels of Rows
-
-
-class Indices:
-    """Particle indices, fixed while tracing: hashable and equal by content, read as an integer array."""
-
-    def __init__(self, indices: Any) -> None:
-        self.indices: np.ndarray = np.array(indices, dtype=np.int32)
-        self.indices.setflags(write=False)
-        self._key = (self.indices.shape, hashlib.sha1(self.indices.tobytes()).hexdigest())
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and self._key == other._key
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.indices, dtype=dtype)
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        return self.indices[index]
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.indices.shape
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(shape={self.shape})"
 
 
 class Topology(Indices):

@@ -1,7 +1,8 @@
 """Particles, the scene of forces and effects that moves them, and the run."""
 
+from jeuler.particles._simulate import simulate
 from jeuler.particles.fields import uses
-from jeuler.particles.scene import Scene, simulate
+from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, empty_pool
 
 __all__ = [

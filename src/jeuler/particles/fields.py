@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
-from jeuler._core import trees
-from jeuler.particles.state import ParticleState, filled
+from jeuler._core.component import Function
+from jeuler.particles.state import ParticleState, with_default_fields
 
 F = TypeVar("F", bound=Callable)
 
@@ -51,15 +51,15 @@ def uses(
 
 def declared(part: Any, what: str, default: Any = ()) -> Any:
     """What a force or effect says of itself: the fields it ``reads``, ``writes`` or ``sets``, or another attribute."""
-    return getattr(part.function if isinstance(part, trees.Function) else part, what, default)
+    return getattr(part.function if isinstance(part, Function) else part, what, default)
 
 
 def name_of(part: Any) -> str:
-    part = part.function if isinstance(part, trees.Function) else part
+    part = part.function if isinstance(part, Function) else part
     return getattr(part, "__name__", type(part).__name__)
 
 
-def completed(state: ParticleState, forces: Iterable, effects: Iterable) -> ParticleState:
+def with_required_fields(state: ParticleState, forces: Iterable, effects: Iterable) -> ParticleState:
     """The state with every field that the effects write; ValueError if a field is missing or in conflict."""
     effects = tuple(effects)
     shapes: dict[str, tuple[int, ...]] = {}
@@ -73,7 +73,7 @@ def completed(state: ParticleState, forces: Iterable, effects: Iterable) -> Part
                         f"writes it too: one of them would be lost; take one of the two out of Scene.effects"
                     )
     written = [name for effect in effects for name in (*declared(effect, "writes"), *declared(effect, "sets"))]
-    state = filled(state, tuple(dict.fromkeys(written)), shapes)
+    state = with_default_fields(state, tuple(dict.fromkeys(written)), shapes)
     for part in (*forces, *effects):
         for field in declared(part, "reads"):
             if field not in state.fields():

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
-from jeuler._core.components import by_component
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.components import by_component, split, stack
 
 # What a particle has in a field that nothing gave a value: (shape of one particle's value, value).
 DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
@@ -26,7 +27,7 @@ DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
 COUNTERS = ("births", "missed_births")  # one number for the whole pool, int32
 
 
-@trees.component()
+@component()
 class ParticleState:
     """What the particles of a system are at one time.
 
@@ -60,18 +61,18 @@ class ParticleState:
       A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.2 (attributes).
     """
 
-    position: trees.Parameter
-    velocity: trees.Parameter
-    mass: trees.Parameter = 1.0
-    alive: trees.Parameter = None
-    age: trees.Parameter = None
-    lifetime: trees.Parameter = None
-    color: trees.Parameter = None
-    opacity: trees.Parameter = None
-    size: trees.Parameter = None
-    shape: trees.Parameter = None
-    births: trees.Parameter = None
-    missed_births: trees.Parameter = None
+    position: Parameter
+    velocity: Parameter
+    mass: Parameter = 1.0
+    alive: Parameter = None
+    age: Parameter = None
+    lifetime: Parameter = None
+    color: Parameter = None
+    opacity: Parameter = None
+    size: Parameter = None
+    shape: Parameter = None
+    births: Parameter = None
+    missed_births: Parameter = None
     extra: dict[str, Array] | None = None
 
     def __post_init__(self) -> None:
@@ -86,7 +87,7 @@ class ParticleState:
                 except (TypeError, ValueError):
                     raise ValueError(f"ParticleState.{field.name} must be an array of numbers, got {value!r}") from None
         if isinstance(self.mass, jax.Array) and jnp.issubdtype(self.mass.dtype, jnp.integer):
-            trees.store_as_float(self, "mass")
+            store_as_float(self, "mass")
 
     def __getattr__(self, name: str) -> Any:
         extra = self.__dict__.get("extra") or {}
@@ -106,7 +107,7 @@ class ParticleState:
         if extra:
             values = {name: x for name, x in values.items() if name in own}
             values["extra"] = {**(self.extra or {}), **extra}
-        return trees.replace(self, **values)
+        return replace(self, **values)
 
     def check(self) -> None:
         """Shapes, dtypes and masses that a run can use; one ValueError that says which cannot."""
@@ -174,7 +175,7 @@ def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -
     return ParticleState(zeros, zeros, mass=mass, alive=jnp.zeros(capacity, bool))
 
 
-def filled(
+def with_default_fields(
     state: ParticleState, names: tuple[str, ...], shapes: dict[str, tuple[int, ...]] | None = None
 ) -> ParticleState:
     """The state with default values in those of the named fields that it lacks; mass becomes one a particle.
@@ -196,7 +197,7 @@ def filled(
     return state.replace(**values) if values else state
 
 
-def parked(state: ParticleState) -> ParticleState:
+def zero_dead_slots(state: ParticleState) -> ParticleState:
     """The state with zeros in the dead slots, whatever an effect left there; masses are kept."""
 
     def park(x: Array) -> Array:
@@ -205,6 +206,18 @@ def parked(state: ParticleState) -> ParticleState:
         return jnp.where(alive.reshape(-1, *(1,) * (x.ndim - 1)), x, jnp.zeros_like(x))
 
     alive = jnp.asarray(state.alive)
-    rest = jax.tree.map(park, trees.replace(state, position=None, velocity=None, mass=None))
+    rest = jax.tree.map(park, replace(state, position=None, velocity=None, mass=None))
     position, velocity = (by_component(park, x) for x in (state.position, state.velocity))
-    return trees.replace(rest, position=position, velocity=velocity, mass=state.mass)
+    return replace(rest, position=position, velocity=velocity, mass=state.mass)
+
+
+def split_state(state: ParticleState) -> tuple[tuple, ParticleState]:
+    """A state as it is carried from step to step: the motion by components, and the rest."""
+    motion = split(state.position), split(state.velocity)
+    return motion, replace(state, position=None, velocity=None)
+
+
+def join_state(parts: tuple[tuple, ParticleState]) -> ParticleState:
+    """The state of these parts."""
+    (position, velocity), rest = parts
+    return replace(rest, position=stack(position), velocity=stack(velocity))

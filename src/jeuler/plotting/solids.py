@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib import colors
 
-from jeuler._core import trees
+from jeuler._core.component import as_component
 from jeuler.contact.colliders import Box, Plane, Sphere
 
 FILL, EDGE = "#d9d4c7", "#8a8578"
@@ -61,7 +61,7 @@ def shaded(rgba: np.ndarray, corners: np.ndarray, toward: np.ndarray) -> np.ndar
 
 def distances(collider: Any, t: float, points: np.ndarray) -> np.ndarray:
     """The distance at points (..., dim)."""
-    collider = trees.as_component(collider)
+    collider = as_component(collider)
     flat = jnp.asarray(points.reshape(-1, points.shape[-1]))
     return np.asarray(_distances(collider, jnp.asarray(t, flat.dtype), flat)).reshape(points.shape[:-1])
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, as_component, as_float, component, store_as_float
 from jeuler._jax import random_rows
 
 
@@ -60,14 +61,14 @@ def draw_named(samplers: dict[str, Any], key: Array, count: int, dtype: Any) -> 
 
 def as_sampler(name: str, x: Any) -> Any:
     """A sampler as a pytree of floating arrays; numbers and arrays become arrays, None stays."""
-    checks.made(f"{name} must be a sampler or a value", x)
+    checks.refuse_class(f"{name} must be a sampler or a value", x)
     if not callable(x):
-        return trees.as_float(x)
+        return as_float(x)
     checks.function(name, x, "(key, count) -> (count, ...)", "a sampler draws all newborns at once")
-    return trees.as_component(x)
+    return as_component(x)
 
 
-@trees.component()
+@component()
 class Uniform(Sampler):
     """Uniform between two bounds, each component by itself.
 
@@ -88,11 +89,11 @@ class Uniform(Sampler):
       sect. 2 (attributes drawn at birth).
     """
 
-    low: trees.Parameter
-    high: trees.Parameter
+    low: Parameter
+    high: Parameter
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "low", "high")
+        store_as_float(self, "low", "high")
 
     @property
     def numbers(self) -> int:
@@ -103,7 +104,7 @@ class Uniform(Sampler):
         return self.low + (self.high - self.low) * u.T.reshape(-1, *shape)
 
 
-@trees.component()
+@component()
 class Normal(Sampler):
     """Normal (Gaussian), each component by itself.
 
@@ -127,7 +128,7 @@ class Normal(Sampler):
     deviation: Array
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "mean", "deviation")
+        store_as_float(self, "mean", "deviation")
 
     @property
     def numbers(self) -> int:
@@ -138,7 +139,7 @@ class Normal(Sampler):
         return self.mean + self.deviation * standard_normal(u).T.reshape(-1, *shape)
 
 
-@trees.component()
+@component()
 class Choice(Sampler):
     """One of the rows of a table, each as likely: a palette of colours, a set of sizes.
 
@@ -158,7 +159,7 @@ class Choice(Sampler):
     values: Array
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "values")
+        store_as_float(self, "values")
 
     numbers = 1
 

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core import checks, trees
+from jeuler._core import checks
+from jeuler._core.component import Parameter, component, store_as_float
 from jeuler._core.vectors import direction
 from jeuler.samplers.base import Sampler, as_sampler, numbers_of, standard_normal
 
 
-@trees.component()
+@component()
 class FromLine(Sampler):
     """Uniform on a line segment.
 
@@ -39,7 +40,7 @@ class FromLine(Sampler):
     end: Array
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "start", "end")
+        store_as_float(self, "start", "end")
 
     numbers = 1
 
@@ -47,7 +48,7 @@ class FromLine(Sampler):
         return self.start + (self.end - self.start) * u.T
 
 
-@trees.component()
+@component()
 class FromDisc(Sampler):
     """Uniform on a disc: in the plane, or in space across a normal.
 
@@ -71,10 +72,10 @@ class FromDisc(Sampler):
 
     center: Array
     radius: Array
-    normal: trees.Parameter = (0.0, 0.0, 1.0)
+    normal: Parameter = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "center", "radius", "normal")
+        store_as_float(self, "center", "radius", "normal")
 
     numbers = 2
 
@@ -87,7 +88,7 @@ class FromDisc(Sampler):
         return self.center + x * first + y * second
 
 
-@trees.component(static=("surface",))
+@component(static=("surface",))
 class FromSphere(Sampler):
     """Uniform in a ball, or on its surface, in any dimension.
 
@@ -113,7 +114,7 @@ class FromSphere(Sampler):
     surface: bool = False
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "center", "radius")
+        store_as_float(self, "center", "radius")
 
     @property
     def numbers(self) -> int:
@@ -126,7 +127,7 @@ class FromSphere(Sampler):
         return self.center + self.radius * share * n
 
 
-@trees.component(static=("faces",))
+@component(static=("faces",))
 class FromSurface(Sampler):
     """Uniform on a surface of triangles (in space or in the plane).
 
@@ -149,7 +150,7 @@ class FromSurface(Sampler):
     faces: tuple[tuple[int, int, int], ...]
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "vertices")
+        store_as_float(self, "vertices")
         faces = np.asarray(self.faces)
         if faces.shape[1:] != (3,) or not faces.size or not np.issubdtype(faces.dtype, np.integer):
             raise ValueError(f"FromSurface.faces must be integers of shape (face, 3), got {faces.dtype} {faces.shape}")
@@ -169,7 +170,7 @@ class FromSurface(Sampler):
         return a[face] + s * ab[face] + q * ac[face]
 
 
-@trees.component()
+@component()
 class Cone(Sampler):
     """Velocities in a cone: directions uniform in the solid angle about an axis, speeds from a sampler.
 
@@ -194,10 +195,10 @@ class Cone(Sampler):
 
     direction: Array
     speed: Any
-    angle: trees.Parameter = 0.0
+    angle: Parameter = 0.0
 
     def __post_init__(self) -> None:
-        trees.store_as_float(self, "direction", "angle")
+        store_as_float(self, "direction", "angle")
         object.__setattr__(self, "speed", as_sampler("Cone.speed", self.speed))
 
     @property

@@ -11,13 +11,14 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.component import component
 from jeuler.steps.explicit import VectorField
 from jeuler.steps.extrapolated import ExtrapolatedStep, extrapolated_euler
 
 PyTree = Any
 
 
-@trees.component()
+@component()
 class AdaptiveSolution:
     """What an adaptive run gives back.
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.component import component
 from jeuler._jax.members import recomputed
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
@@ -22,7 +23,7 @@ PyTree = Any
 Checkpoint = int | Literal["sqrt", "reversible"] | None
 
 
-@trees.component()
+@component()
 class Solution:
     """What a run gives back.
 
@@ -104,7 +105,7 @@ def solve(
     def next_state(n, t, y_and_lost):
         return advance(f, t, y_and_lost, grid.dt, args)
 
-    return march(next_state, (y0, no_loss(y0, compensated)), grid, save)
+    return scan_grid(next_state, (y0, no_remainder(y0, compensated)), grid, save)
 
 
 def solve_reversibly(
@@ -125,7 +126,7 @@ def solve_reversibly(
         first_nonfinite, y = between_saves(n, first_nonfinite, y)
         return n + grid.save_every, first_nonfinite, (y, lost)
 
-    return march(lambda n, t, state: state, (y0, None), grid, save, within=within)
+    return scan_grid(lambda n, t, state: state, (y0, None), grid, save, within=within)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +159,7 @@ class Grid:
         return self.t0 + n.astype(self.dt.dtype) * self.dt
 
 
-def march(
+def scan_grid(
     next_state: Callable[[Array, Array, PyTree], PyTree],
     start: tuple[PyTree, PyTree],
     grid: Grid,
@@ -223,7 +224,7 @@ def _scan(body: Callable, carry: PyTree, count: int, segment: int | None) -> tup
     return carry, out
 
 
-def no_loss(y: PyTree, compensated: bool) -> PyTree:
+def no_remainder(y: PyTree, compensated: bool) -> PyTree:
     """What rounding has cut off y at the start of a run: nothing."""
     return jax.tree.map(jnp.zeros_like, y) if compensated else None
 

@@ -1,0 +1,39 @@
+"""Indices of particles, fixed while tracing."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+
+class Indices:
+    """Particle indices, fixed while tracing: hashable and equal by content, read as an integer array."""
+
+    def __init__(self, indices: Any) -> None:
+        self.indices: np.ndarray = np.array(indices, dtype=np.int32)
+        self.indices.setflags(write=False)
+        self._key = (self.indices.shape, hashlib.sha1(self.indices.tobytes()).hexdigest())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and self._key == other._key
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.indices, dtype=dtype)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.indices[index]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.indices.shape
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(shape={self.shape})"
