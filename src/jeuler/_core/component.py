@@ -14,14 +14,19 @@ from jax.typing import ArrayLike
 Parameter = Any  # of a component: a number, list or array as passed, a floating array as kept
 T = TypeVar("T")
 
+_PARAMETERS: dict[type, dict[str, bool]] = {}  # of each class of components: name, whether positive
+
 
 @dataclass_transform(frozen_default=True)
-def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
+def component(
+    static: tuple[str, ...] = (), *, parameters: tuple[str, ...] | None = None, positive: tuple[str, ...] = ()
+) -> Callable[[type[T]], type[T]]:
     """Make a class a frozen dataclass that is also a pytree.
 
     Fields named in ``static`` are part of the structure (hashable, fixed while tracing), all others are
     children. Unflattening does not call ``__init__``, so a ``__post_init__`` sees what a person passed and never a
-    transformation's placeholder.
+    transformation's placeholder. What a fit may vary are the ``parameters``, None: all that are not static; those that
+    are ``positive`` are never below 0. `parameters_of` reads these two.
     """
 
     def decorate(cls: type[T]) -> type[T]:
@@ -44,6 +49,7 @@ def component(static: tuple[str, ...] = ()) -> Callable[[type[T]], type[T]]:
             return x
 
         jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+        _PARAMETERS[cls] = {name: name in positive for name in (children if parameters is None else parameters)}
         return cls
 
     return decorate
@@ -72,6 +78,24 @@ def store_as_float(component: Any, *names: str) -> None:
             where = f"{type(component).__name__}.{name}"
             raise ValueError(f"{where} must be a number, or an array or list of numbers, got {value!r}") from None
         object.__setattr__(component, name, value)
+
+
+def parameters_of(part: Any) -> dict[str, bool]:
+    """The fields of a component that a fit may vary, by name, with whether each is positive by its meaning.
+
+    Only fields that hold numbers now: not an air, a collider or a function of time, and not None.
+    A dataclass of the person's own that does not say which has all its fields that hold floating numbers.
+    """
+    kind = type(part)
+    if kind in _PARAMETERS:
+        named = _PARAMETERS[kind]
+    else:
+        named = {field.name: False for field in dataclasses.fields(part)} if dataclasses.is_dataclass(part) else {}
+    return {name: positive for name, positive in named.items() if _is_number(getattr(part, name))}
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, float) or jnp.issubdtype(getattr(x, "dtype", bool), jnp.floating)
 
 
 @component(static=("function",))

@@ -15,7 +15,7 @@ from jeuler.contact.colliders import check_collider
 from jeuler.contact.impacts import Impacts, Path
 
 
-@component(static=("pairs", "max_bounces"))
+@component(static=("pairs", "max_bounces"), positive=("radius", "restitution", "friction"))
 class Collisions:
     """Contact with restitution and Coulomb friction, resolved where on its way a particle meets the surface.
 

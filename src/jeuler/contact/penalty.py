@@ -13,7 +13,7 @@ from jeuler._core.component import Parameter, as_component, component, store_as_
 from jeuler.contact.colliders import check_collider, normal_and_speed
 
 
-@component()
+@component(positive=("ks", "kd", "radius"))
 class PenaltyContact:
     """A stiff one-sided spring and damper at the surface of a collider.
 

@@ -108,7 +108,7 @@ def along(s: Array, times: Array, values: Array, *, stepwise: bool) -> Array:
     return total
 
 
-@component()
+@component(positive=("limit",))
 class SpeedLimit:
     """No particle faster than a limit; the direction is kept.
 

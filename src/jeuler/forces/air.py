@@ -69,7 +69,7 @@ class Wind:
         return jnp.broadcast_to(at_time(self.velocity, t, position.dtype), position.shape)
 
 
-@component()
+@component(positive=("period",))
 class Gust:
     """A gust that comes again and again and fades between.
 
@@ -99,7 +99,7 @@ class Gust:
         return jnp.broadcast_to((self.velocity * strength).astype(position.dtype), position.shape)
 
 
-@component()
+@component(positive=("speed", "size", "time"))
 class Turbulence:
     """A random wind without sources, a sum of waves that drift: eddies of one size.
 
@@ -178,7 +178,7 @@ def turbulence(
     return Turbulence(speed, size, time, *map(jnp.asarray, (waves, across, phases, frequencies)))
 
 
-@component()
+@component(positive=("core",))
 class Vortex:
     """Air that turns about an axis, with a core that turns like a solid body.
 

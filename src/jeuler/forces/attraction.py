@@ -14,7 +14,7 @@ from jeuler._core.components import mass_that_feels, per_particle
 from jeuler._core.in_time import at_time, moving
 
 
-@component(static=("power",))
+@component(static=("power",), positive=("softening",))
 class PointAttractor:
     """A point that pulls every particle; with negative strength it pushes.
 

@@ -28,7 +28,7 @@ def unless_too_long(rate: Array, dt: Array) -> Array:
     return jnp.where(too_long, 1 / jnp.where(too_long, steps, 1), 1)
 
 
-@component()
+@component(positive=("coefficient",))
 class LinearDrag:
     """Drag in proportion to the speed relative to the air (Stokes drag).
 
@@ -75,7 +75,7 @@ class LinearDrag:
         check_air("LinearDrag", self.air, particles, dim)
 
 
-@component()
+@component(positive=("coefficient",))
 class QuadraticDrag:
     """Drag in proportion to the square of the speed relative to the air.
 

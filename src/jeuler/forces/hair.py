@@ -106,7 +106,7 @@ class _OnStrands:
             raise ValueError(f"{type(self).__name__} needs particles in space, dim 3, got dim {dim}")
 
 
-@component(static=("strands",))
+@component(static=("strands",), positive=("stiffness", "damping", "smoothing"))
 class StrandBending(_OnStrands):
     """Bending springs of curly hair: each edge is pulled to its rest direction in the frame of the smoothed strand.
 
@@ -159,7 +159,7 @@ class StrandBending(_OnStrands):
         return give_to_ends(pull.astype(position.dtype), self.here, nodes[:, 1:], position)
 
 
-@component(static=("strands",))
+@component(static=("strands",), positive=("stiffness", "damping", "smoothing"))
 class StrandCore(_OnStrands):
     """Core springs of curly hair: they keep the coils from being pulled straight, yet let them sway.
 

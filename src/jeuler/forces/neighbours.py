@@ -15,7 +15,7 @@ from jeuler._core.vectors import direction
 from jeuler.graphs.topology import Topology
 
 
-@component(static=("edges",))
+@component(static=("edges",), positive=("coefficient",))
 class Viscosity:
     """Friction between neighbours: each particle is dragged along by those that it is joined to.
 
@@ -64,7 +64,7 @@ def only_among(alive: Array, groups: Any, coefficient: Array) -> Array:
     return jnp.where(jnp.all(alive[np.asarray(groups)], axis=1), coefficient, 0)
 
 
-@component(static=("triples",))
+@component(static=("triples",), positive=("stiffness",))
 class Bending:
     """Resistance of a rope, a hair or a cloth to bending, about each middle particle.
 

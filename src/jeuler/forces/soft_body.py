@@ -41,7 +41,7 @@ def turning(s: Array, skew: Array) -> Array:
     return jnp.linalg.solve(both_sides, skew.reshape(-1)).reshape(s.shape)
 
 
-@component(static=("particles",))
+@component(static=("particles",), positive=("stiffness", "damping"))
 class ShapeMatching:
     """A soft body: each particle is pulled to its place in the rest shape, moved and turned as the body is now.
 

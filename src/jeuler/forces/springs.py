@@ -57,7 +57,7 @@ def _coefficient_jvp(primals, tangents):
     return c, dot(slopes, changes)
 
 
-@component(static=("edges",))
+@component(static=("edges",), positive=("ks", "kd", "rest_length"))
 class Springs:
     """Linear springs and dampers between pairs of particles.
 
