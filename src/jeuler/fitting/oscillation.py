@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jeuler.fitting.spectrum import power_spectrum, refined_line, seen_samples
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
@@ -18,30 +19,49 @@ class Oscillation(NamedTuple):
     decay_rate: float
 
 
+EXACT_ROWS = 500  # a Lomb-Scargle periodogram costs rows squared; beyond this the FFT is as good and far cheaper
+
+
 def estimate_oscillation(times: np.ndarray, values: np.ndarray) -> Oscillation:
     """The strongest line in the spectrum of (time, column) data, and how fast the motion dies away.
 
     A start for a fit: the frequency to about a tenth of a line's width, the decay from the two halves of the record.
-    NaN = not observed; the sampling may be uneven (Lomb-Scargle periodogram).
+    NaN = not observed; the sampling may be uneven. Time and memory grow as N log N.
     """
-    from scipy.signal import lombscargle
-
     span = times[-1] - times[0]
-    frequencies = 2 * np.pi / span * np.arange(0.4, max(len(times) / 2, 2), 0.1)
-    power = np.zeros_like(frequencies)
-    decays = []
-    for column in values.T:
-        seen = np.isfinite(column)
-        if seen.sum() < 4 or np.ptp(column[seen]) == 0:
-            continue
-        t, x = times[seen], column[seen] - column[seen].mean()
-        power += lombscargle(t, x, frequencies)
-        early, late = t < t[0] + span / 2, t >= t[0] + span / 2
-        if early.sum() > 1 and late.sum() > 1 and x[late].std() > 0:
-            decays.append(np.log(x[early].std() / x[late].std()) / (span / 2))
-    omega = float(frequencies[np.argmax(power)])
+    moving = [c for c in values.T if np.isfinite(c).sum() >= 4 and np.ptp(c[np.isfinite(c)]) > 0]
+    if not moving or span <= 0:
+        raise ValueError(
+            f"nothing moves in the {values.shape[1]} columns of {len(times)} rows, or none has 4 values; "
+            f"an oscillation cannot be fitted to that"
+        )
+    omega = _strongest_line(times, moving, span)
+    decays = [decay for column in moving if (decay := _decay(times, column, span)) is not None]
     decay = float(np.median(decays)) if decays else 0.0
-    return Oscillation(omega, float(np.clip(decay, 0.005 * omega, 0.7 * omega)))
+    return Oscillation(omega, float(np.clip(decay, 0.0005 * omega, 0.7 * omega)))
+
+
+def _strongest_line(times: np.ndarray, columns: list[np.ndarray], span: float) -> float:
+    if len(times) <= EXACT_ROWS:
+        from scipy.signal import lombscargle
+
+        samples = [seen_samples(times, column) for column in columns]
+        cycles = np.arange(0.4, max(max(len(t) for t, _ in samples) / 2, 2), 0.1)
+        frequencies = 2 * np.pi / span * cycles
+        return float(frequencies[np.argmax(sum(lombscargle(*sample, frequencies) for sample in samples))])
+    frequencies, power = power_spectrum(times, columns[0], span)
+    for column in columns[1:]:
+        power = power + np.interp(frequencies, *power_spectrum(times, column, span), right=0.0)
+    return refined_line(times, columns, float(frequencies[np.argmax(power)]), span)
+
+
+def _decay(times: np.ndarray, column: np.ndarray, span: float) -> float | None:
+    """The decay rate from the sizes of the two halves; None where one has no motion."""
+    t, x = seen_samples(times, column)
+    early, late = x[t < t[0] + span / 2], x[t >= t[0] + span / 2]
+    if len(early) < 2 or len(late) < 2 or not early.std() > 0 or not late.std() > 0:
+        return None
+    return float(np.log(early.std() / late.std()) / (span / 2))
 
 
 class Mode(NamedTuple):
