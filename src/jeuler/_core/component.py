@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from jeuler._core.describe import object_table, summary
+
 Parameter = Any  # of a component: a number, list or array as passed, a floating array as kept
 T = TypeVar("T")
 
@@ -30,7 +32,7 @@ def component(
     """
 
     def decorate(cls: type[T]) -> type[T]:
-        cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+        cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(_shown(cls))
         names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]  # made one above
         children = tuple(name for name in names if name not in static)
         keys = tuple(jax.tree_util.GetAttrKey(name) for name in children)
@@ -53,6 +55,20 @@ def component(
         return cls
 
     return decorate
+
+
+@dataclass_transform(frozen_default=True)
+def result(cls: type[T]) -> type[T]:
+    """Make a class a frozen dataclass that holds what a function found, and shows it on one screen."""
+    return dataclasses.dataclass(frozen=True, repr=False)(_shown(cls))
+
+
+def _shown(cls: type[T]) -> type[T]:
+    """The class with a ``repr`` of names and shapes and a table for notebooks, unless it has its own."""
+    for name, method in (("__repr__", summary), ("_repr_html_", object_table)):
+        if getattr(cls, name, None) in (None, getattr(object, name, None)):
+            setattr(cls, name, method)
+    return cls
 
 
 def as_float(x: ArrayLike | None) -> Array | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any
 
@@ -10,6 +9,7 @@ import jax
 import numpy as np
 
 from jeuler._core import checks
+from jeuler._core.component import result
 from jeuler._core.precision import flat
 from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
@@ -21,7 +21,7 @@ PyTree = Any
 PILOT_WORK = 2**25  # numbers advanced in the longest pilot run
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class StepAdvice:
     """What `advise_step` found.
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import trees
+from jeuler._core.component import result
 from jeuler.accuracy.timing import counting
 from jeuler.solving._adaptive import solve_adaptive
 from jeuler.solving._scan import solve
@@ -22,7 +23,7 @@ MOST_SAVED = 64  # states kept of a run, beside the first
 MOST_ADAPTIVE_STEPS = 100_000
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Compensated:
     """A step to be summed with compensation; in the ``steps`` of `work_precision` only.
 

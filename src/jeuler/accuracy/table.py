@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import math
 import os
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+
+from jeuler._core.component import result
+from jeuler._core.describe import table
 
 NAN = math.nan
 EMPTY_ROW: dict[str, Any] = {
@@ -41,7 +43,7 @@ EMPTY_ROW: dict[str, Any] = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Summary:
     """What the rows of one method in one precision say together.
 
@@ -61,7 +63,7 @@ class Summary:
     stability_limit: float
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class WorkPrecision:
     """Error against seconds, one row a run.
 
@@ -153,6 +155,11 @@ class WorkPrecision:
                     cells += [f"{row['gradient_bytes'] / 2**20:.2f}"]
             lines.append("| " + " | ".join(cells) + " |")
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        lines = (line.removeprefix("|").removesuffix("|").split("|") for line in self.to_markdown().splitlines())
+        head, _, *rows = ([cell.strip("* ") for cell in cells] for cells in lines)
+        return table("WorkPrecision", rows, head)
 
     def plot(self, ax: Any = None) -> Any:
         """Error against seconds and error against dt, logarithmic, each method labelled at its line.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import trees
+from jeuler._core.component import result
 from jeuler.diagnosis.rerun import Rerun, coincident, largest, lost_particles, springs_among
 from jeuler.particles.fields import name_of, with_required_fields
 from jeuler.particles.scene import Scene
@@ -18,7 +20,7 @@ from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, euler_step
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Diagnosis:
     """Where a run stopped being finite, and why.
 
@@ -48,6 +50,9 @@ class Diagnosis:
     springs: tuple[int, ...] = ()
     cause: str = ""
     remedy: str = ""
+
+    def _repr_html_(self) -> str:
+        return f"<div><b>Diagnosis</b>: {html.escape(str(self))}</div>"
 
     def __str__(self) -> str:
         if self.finite:

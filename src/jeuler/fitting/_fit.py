@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -15,6 +14,8 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from jeuler._core import checks
+from jeuler._core.component import result
+from jeuler.fitting._tables import fit_table
 from jeuler.fitting.minimise import JACOBIAN_BYTES, LeastSquares, Progress, descend, levenberg_marquardt
 from jeuler.fitting.uncertainty import covariance
 from jeuler.fitting.unknowns import Unknowns
@@ -22,7 +23,7 @@ from jeuler.fitting.unknowns import Unknowns
 PyTree = Any
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Fit:
     """What a fit found.
 
@@ -56,6 +57,8 @@ class Fit:
     message: str
     undetermined: tuple[str, ...]
     nonfinite: int
+
+    _repr_html_ = fit_table
 
 
 def fit(

@@ -11,8 +11,10 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
+from jeuler._core.component import result
 from jeuler._core.interpolate import hermite
 from jeuler.fitting._fit import fit
+from jeuler.fitting._tables import fit_table
 from jeuler.fitting.observations import amplitude_of, checked_observations, horizons, place_in_steps, speed_of
 from jeuler.fitting.parameters import is_positive, put_parameters, read_parameters, values_in_forces
 from jeuler.particles._simulate import simulate
@@ -23,7 +25,7 @@ from jeuler.steps.explicit import Step, rk4_step
 PyTree = Any
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class SpringFit:
     """What `fit_springs` found.
 
@@ -64,6 +66,8 @@ class SpringFit:
     message: str
     undetermined: tuple[str, ...]
     nonfinite: int
+
+    _repr_html_ = fit_table
 
 
 def fit_springs(

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jeuler._core.describe import object_table, summary
+
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
 
@@ -28,6 +30,12 @@ class Trajectory(NamedTuple):
 
     times: np.ndarray
     columns: dict[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        return summary(self)
+
+    def _repr_html_(self) -> str:
+        return object_table(self)
 
 
 def read_trajectory(path: str | os.PathLike[str], *, time: str | None = None) -> Trajectory:

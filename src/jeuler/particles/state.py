@@ -90,15 +90,16 @@ class ParticleState:
             store_as_float(self, "mass")
 
     def __getattr__(self, name: str) -> Any:
-        extra = self.__dict__.get("extra") or {}
+        extra = vars(self).get("extra") or {}
         if name in extra:
             return extra[name]
         raise AttributeError(f"the state has no field {name!r}; it has {', '.join(self.fields())}")
 
     def fields(self) -> tuple[str, ...]:
         """The names of the fields that are there."""
-        own = [f.name for f in dataclasses.fields(self) if f.name != "extra" and getattr(self, f.name) is not None]
-        return (*own, *(self.extra or {}))
+        there = vars(self)  # not getattr: copy and pickle ask an object for attributes before it has any
+        own = [f.name for f in dataclasses.fields(self) if f.name != "extra" and there.get(f.name) is not None]
+        return (*own, *(there.get("extra") or {}))
 
     def replace(self, **values: Any) -> ParticleState:
         """A state with these fields instead; a name that is not a field of its own goes to ``extra``."""

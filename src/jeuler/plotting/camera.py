@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 
+from jeuler._core.component import result
 
-@dataclasses.dataclass(frozen=True)
+
+@result
 class Camera:
     """What a picture shows.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +13,7 @@ from matplotlib import animation, colors
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
+from jeuler._core.component import result
 from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View, new_axes
 from jeuler.plotting.render import Look, Picture, alive_of
@@ -59,7 +59,7 @@ def animate(
     return film
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Film:
     """Frames of a solution that are drawn when they are asked for."""
 

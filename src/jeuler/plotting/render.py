@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from matplotlib import colors
 from matplotlib import pyplot as plt
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 
+from jeuler._core.component import result
 from jeuler.particles.fields import declared
 from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View, new_axes
@@ -20,7 +20,7 @@ DEFAULT_COLOR, DEFAULT_SIZE = (0.13, 0.35, 0.62), 4.0  # points, where the state
 STRAIN = colors.LinearSegmentedColormap.from_list("strain", ["#2166ac", "#555555", "#b2182b"])
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Look:
     """How a picture shows what there is.
 

@@ -7,12 +7,13 @@ from typing import Any
 
 import jax
 
+from jeuler._core.component import result
 from jeuler.particles import ParticleState, Scene, simulate
 from jeuler.solving._scan import Solution
 from jeuler.steps.explicit import symplectic_euler_step
 
 
-@dataclasses.dataclass(frozen=True)
+@result
 class Setup:
     """A scene that is ready to run and to be looked at.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
+from jeuler._core.component import result
 
-@dataclasses.dataclass(frozen=True)
+
+@result
 class Body:
     """Particles at rest and how they are joined.
 

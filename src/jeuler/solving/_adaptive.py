@@ -12,6 +12,7 @@ from jax import Array, lax
 
 from jeuler._core import checks, trees
 from jeuler._core.component import component
+from jeuler.solving._tables import adaptive_table
 from jeuler.steps.explicit import VectorField
 from jeuler.steps.extrapolated import ExtrapolatedStep, extrapolated_euler
 
@@ -43,6 +44,8 @@ class AdaptiveSolution:
     num_rejected: Array
     error: PyTree
     finished: Array
+
+    _repr_html_ = adaptive_table
 
 
 def solve_adaptive(

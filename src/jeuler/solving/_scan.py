@@ -17,6 +17,7 @@ from jeuler._core.component import component
 from jeuler._jax.members import recomputed
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
+from jeuler.solving._tables import solution_table
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -42,6 +43,8 @@ class Solution:
     t: Array
     y: PyTree
     first_nonfinite: Array
+
+    _repr_html_ = solution_table
 
 
 def solve(

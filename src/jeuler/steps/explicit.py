@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -202,7 +203,7 @@ def rk4_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
     return runge_kutta_increment(RK4, f, t, y, dt, args)
 
 
-def cap_cotangent(step: Step, max_norm: float) -> Step:
+def cap_cotangent(step: Step, max_norm: float) -> CappedStep:
     """Make a step whose state passes back a cotangent of bounded norm: for long chaotic horizons.
 
         forward: the step as it is      reverse: c -> c min(1, max_norm / |c|),   |c|^2 summed over the whole state
@@ -226,27 +227,51 @@ def cap_cotangent(step: Step, max_norm: float) -> Step:
       sect. 3.2.
     """
     checks.positive("max_norm", max_norm)
+    return CappedStep(step, max_norm if checks.is_traced(max_norm) else float(max_norm))
 
-    @jax.custom_vjp
-    def cap(y: PyTree) -> PyTree:
-        return y
 
-    def forward(y: PyTree) -> tuple[PyTree, None]:
-        return y, None
+@dataclasses.dataclass(frozen=True)
+class CappedStep:
+    """A step whose state passes back a cotangent of bounded norm; see `cap_cotangent`.
 
-    def backward(_: None, cotangent: PyTree) -> tuple[PyTree]:
-        # scaled by the largest entry first, so that the square does not overflow
-        largest = trees.largest(cotangent)
-        unit = jnp.where(largest > 0, largest, 1)
-        norm = unit * jnp.sqrt(sum(jnp.sum(jnp.abs(c / unit) ** 2) for c in jax.tree.leaves(cotangent)))
-        return (trees.scale(jnp.where(norm > max_norm, max_norm / norm, 1), cotangent),)
+    It has no ``increment``, which compensated sums would add to y themselves, past the cap.
+    """
 
-    cap.defvjp(forward, backward)
+    step: Step
+    max_norm: float
 
-    @functools.wraps(step)
-    def capped(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
-        return step(f, t, cap(y), dt, args)
+    @property
+    def __name__(self) -> str:
+        return getattr(self.step, "__name__", "step")
 
-    if hasattr(step, "increment"):  # compensated sums add it to y themselves, so the cap would miss that way
-        del capped.increment  # type: ignore[attr-defined]
-    return capped
+    @property
+    def order(self) -> int:
+        return self.step.order  # type: ignore[attr-defined]  # a step need not have one; then this has none
+
+    @property
+    def with_info(self) -> Any:
+        return self.step.with_info  # type: ignore[attr-defined]  # implicit steps have it
+
+    def __call__(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
+        return self.step(f, t, capped(y, self.max_norm), dt, args)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
+def capped(y: PyTree, max_norm: Any) -> PyTree:
+    """y, whose cotangent is scaled down to the norm max_norm where it is larger."""
+    return y
+
+
+def _capped_forward(y: PyTree, max_norm: Any) -> tuple[PyTree, None]:
+    return y, None
+
+
+def _capped_backward(max_norm: Any, _: None, cotangent: PyTree) -> tuple[PyTree]:
+    # scaled by the largest entry first, so that the square does not overflow
+    largest = trees.largest(cotangent)
+    unit = jnp.where(largest > 0, largest, 1)
+    norm = unit * jnp.sqrt(sum(jnp.sum(jnp.abs(c / unit) ** 2) for c in jax.tree.leaves(cotangent)))
+    return (trees.scale(jnp.where(norm > max_norm, max_norm / norm, 1), cotangent),)
+
+
+capped.defvjp(_capped_forward, _capped_backward)

@@ -6,6 +6,7 @@ order, at the price of one linear solve each.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from jeuler._core import checks, trees
 from jeuler._jax.jaxpr import is_variable
 from jeuler._jax.root import root
 from jeuler.steps._newton import StepInfo, linear_solver_for, newton_then_damped, solve_linear
-from jeuler.steps.explicit import Step, VectorField
+from jeuler.steps.explicit import VectorField
 
 PyTree = Any
 
@@ -30,7 +31,7 @@ def implicit_euler(
     max_steps: int = 50,
     damped_steps: int = 500,
     linear_solver: Any = None,
-) -> Step:
+) -> ImplicitEuler:
     """Make a backward (implicit) Euler step with these tolerances.
 
         y(t + dt) = y + dt f(t + dt, y(t + dt), args)
@@ -64,56 +65,67 @@ def implicit_euler(
         if tolerance is not None:
             checks.positive(name, tolerance)
     max_steps, damped_steps = checks.count("max_steps", max_steps, least=1), checks.count("damped_steps", damped_steps)
+    return ImplicitEuler(rtol, atol, max_steps, damped_steps, linear_solver)
 
-    def with_info(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, StepInfo]:
+
+@dataclasses.dataclass(frozen=True)
+class ImplicitEuler:
+    """One backward (implicit) Euler step, solved to tolerance, with derivatives of the exact solution.
+
+        y(t + dt) = y + dt f(t + dt, y(t + dt), args)
+
+    Args:
+      f: vector field, ``f(t, y, args) -> dy/dt``, of the structure of y.
+      t: time, scalar, s.
+      y: state, any pytree of floating or complex arrays.
+      dt: step size, scalar, s. Every dt is stable where the equation itself is.
+      args: passed to f; any pytree.
+    Returns: the state at t + dt, NaN if it did not converge. Its cumulative error is O(dt).
+    Raises: ValueError, at trace time, if y is not floating. See `implicit_euler` for its tolerances.
+    Example:
+      >>> import jeuler
+      >>> round(float(jeuler.implicit_euler_step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None)), 6)
+      0.5
+
+    Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8.
+    """
+
+    rtol: float | None = None
+    atol: float | None = None
+    max_steps: int = 50
+    damped_steps: int = 500
+    linear_solver: Any = None
+
+    __name__ = "implicit_euler_step"
+    order = 1
+
+    def __call__(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
+        return self.with_info(f, t, y, dt, args)[0]
+
+    def with_info(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, StepInfo]:
+        """The state at t + dt, and how the iterations went."""
         system = _system(f, t, y, dt, args)
         floor = system.roundoff
         if not floor.size:
             return y, StepInfo(jnp.asarray(True), jnp.int32(0))
-        relative = rtol if rtol is not None else 1e-9 if floor.dtype == jnp.float64 else 1e-5
-        scale = lax.stop_gradient(atol if atol is not None else 1e-3 * relative) + floor
+        relative = self.rtol if self.rtol is not None else 1e-9 if floor.dtype == jnp.float64 else 1e-5
+        scale = lax.stop_gradient(self.atol if self.atol is not None else 1e-3 * relative) + floor
 
         def scaled_residual(z):  # in units of the tolerance, so that solvers see numbers of one kind
             return system.residual(z * scale) / scale
 
         solve = newton_then_damped(
             rtol=relative,
-            max_steps=max_steps,
-            damped_steps=damped_steps,
-            linear_solver=linear_solver or linear_solver_for(floor, rtol=1e-4, atol=0.1),
+            max_steps=self.max_steps,
+            damped_steps=self.damped_steps,
+            linear_solver=self.linear_solver or linear_solver_for(floor, rtol=1e-4, atol=0.1),
         )
-        tangent_solve = functools.partial(solve_linear, solver=linear_solver)
+        tangent_solve = functools.partial(solve_linear, solver=self.linear_solver)
         z, info = root(scaled_residual, system.start / scale, solve, tangent_solve)
         return system.state(z * scale * jnp.where(info.converged, 1, jnp.nan)), info
 
-    def implicit_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
-        """One backward (implicit) Euler step, solved to tolerance, with derivatives of the exact solution.
 
-            y(t + dt) = y + dt f(t + dt, y(t + dt), args)
-
-        Args:
-          f: vector field, ``f(t, y, args) -> dy/dt``, of the structure of y.
-          t: time, scalar, s.
-          y: state, any pytree of floating or complex arrays.
-          dt: step size, scalar, s. Every dt is stable where the equation itself is.
-          args: passed to f; any pytree.
-        Returns: the state at t + dt, NaN if it did not converge. Its cumulative error is O(dt).
-        Raises: ValueError, at trace time, if y is not floating. See `implicit_euler` for its tolerances.
-        Example:
-          >>> import jeuler
-          >>> round(float(jeuler.implicit_euler_step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None)), 6)
-          0.5
-
-        Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.3 and IV.8.
-        """
-        return with_info(f, t, y, dt, args)[0]
-
-    implicit_euler_step.with_info = with_info  # type: ignore[attr-defined]  # functions may carry attributes
-    implicit_euler_step.order = 1  # type: ignore[attr-defined]
-    return implicit_euler_step
-
-
-def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
+def linearly_implicit_euler(*, linear_solver: Any = None) -> LinearlyImplicitEuler:
     """Make a linearly implicit Euler step with this linear solver.
 
         y(t + dt) = y + w,   (I - dt J) w = dt f(t + dt, y, args),   J = df/dy at (t + dt, y)
@@ -135,27 +147,37 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.9, eq. 9.25; D. Baraff,
       A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, eq. 6.
     """
+    return LinearlyImplicitEuler(linear_solver)
 
-    def linearly_implicit_euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
-        """One linearly implicit Euler step: the first Newton iteration of backward Euler, one linear solve.
 
-            y(t + dt) = y + w,   (I - dt J) w = dt f(t + dt, y, args),   J = df/dy at (t + dt, y)
+@dataclasses.dataclass(frozen=True)
+class LinearlyImplicitEuler:
+    """One linearly implicit Euler step: the first Newton iteration of backward Euler, one linear solve.
 
-        Args:
-          f: vector field, ``f(t, y, args) -> dy/dt``, of the structure of y.
-          t: time, scalar, s.
-          y: state, any pytree of floating or complex arrays.
-          dt: step size, scalar, s.
-          args: passed to f; any pytree.
-        Returns: the state at t + dt, NaN where the linear solve failed. Its cumulative error is O(dt).
-        Raises: ValueError, at trace time, if y is not floating.
-        Example:
-          >>> import jeuler
-          >>> round(float(jeuler.linearly_implicit_euler_step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None)), 6)
-          0.5
+        y(t + dt) = y + w,   (I - dt J) w = dt f(t + dt, y, args),   J = df/dy at (t + dt, y)
 
-        Source: D. Baraff, A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, eq. 6.
-        """
+    Args:
+      f: vector field, ``f(t, y, args) -> dy/dt``, of the structure of y.
+      t: time, scalar, s.
+      y: state, any pytree of floating or complex arrays.
+      dt: step size, scalar, s.
+      args: passed to f; any pytree.
+    Returns: the state at t + dt, NaN where the linear solve failed. Its cumulative error is O(dt).
+    Raises: ValueError, at trace time, if y is not floating.
+    Example:
+      >>> import jeuler
+      >>> round(float(jeuler.linearly_implicit_euler_step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None)), 6)
+      0.5
+
+    Source: D. Baraff, A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, eq. 6.
+    """
+
+    linear_solver: Any = None
+
+    __name__ = "linearly_implicit_euler_step"
+    order = 1
+
+    def __call__(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
         y = checks.state("y", y)
         slope, push = jax.linearize(lambda y: f(t + dt, y, args), y)
 
@@ -166,10 +188,7 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> Step:
         if not system.start.size:
             return y
         value, matvec = jax.linearize(system.residual, system.start)
-        return system.state(system.start - solve_linear(matvec, value, solver=linear_solver))
-
-    linearly_implicit_euler_step.order = 1  # type: ignore[attr-defined]
-    return linearly_implicit_euler_step
+        return system.state(system.start - solve_linear(matvec, value, solver=self.linear_solver))
 
 
 implicit_euler_step = implicit_euler()
