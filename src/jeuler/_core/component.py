@@ -12,6 +12,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jeuler._core.describe import object_table, summary
+from jeuler._core.partition import Rest, is_parameter, partition
 
 Parameter = Any  # of a component: a number, list or array as passed, a floating array as kept
 T = TypeVar("T")
@@ -102,6 +103,7 @@ def parameters_of(part: Any) -> dict[str, bool]:
     Only fields that hold numbers now: not an air, a collider or a function of time, and not None.
     A dataclass of the person's own that does not say which has all its fields that hold floating numbers.
     """
+    part = part.whole() if isinstance(part, Partitioned) else part
     kind = type(part)
     if kind in _PARAMETERS:
         named = _PARAMETERS[kind]
@@ -124,11 +126,48 @@ class Function:
         return self.function(*args, **fields)
 
 
+@component(static=("rest",))
+class Partitioned:
+    """A callable pytree that holds more than floating arrays, such as a neural network: only these are its leaves.
+
+    It has the attributes of what it was made of.
+    """
+
+    arrays: list
+    rest: Rest
+
+    def whole(self) -> Any:
+        """What it was made of, with the arrays of now."""
+        return self.rest.join(self.arrays)
+
+    def __call__(self, *args: Any, **fields: Any) -> Any:
+        return self.whole()(*args, **fields)
+
+    def __repr__(self) -> str:
+        return summary(self.whole())
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or "rest" not in self.__dict__:  # copy and pickle ask before there is anything
+            raise AttributeError(name)
+        return getattr(self.whole(), name)
+
+
 def replace(component: T, **changes: Any) -> T:
     """The component with some fields changed; ``dataclasses.replace``, as type checkers understand it."""
+    if isinstance(component, Partitioned):
+        return as_component(dataclasses.replace(component.whole(), **changes))
     return dataclasses.replace(component, **changes)  # type: ignore[type-var]  # components are
 
 
 def as_component(x: Any) -> Any:
-    """x if it is a pytree of arrays already; a plain function is wrapped, so that no leaf is a function."""
-    return Function(x) if callable(x) and jax.tree_util.all_leaves([x]) else x
+    """x as a pytree of floating arrays: as it is, or wrapped where it is a function or holds other leaves."""
+    leaves = jax.tree.leaves(x)
+    if not callable(x) or all(map(is_parameter, leaves)):
+        return x
+    is_leaf = len(leaves) == 1 and leaves[0] is x
+    return Function(x) if is_leaf else Partitioned(*partition(x, is_parameter))
+
+
+def unwrapped(x: Any) -> Any:
+    """What a person passed in place of a component."""
+    return x.function if isinstance(x, Function) else x.whole() if isinstance(x, Partitioned) else x

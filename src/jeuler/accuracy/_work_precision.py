@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jeuler._core import checks, trees
+from jeuler._core.partition import arrays_only, is_parameter
 from jeuler._core.precision import cast, double_precision, flat, flat_rows, precision
 from jeuler.accuracy.reference import (
     Reference,
@@ -99,6 +100,7 @@ def work_precision(
 
     y0 = checks.state("y0", y0)
     checks.untraced("work_precision", y0, args, t0, t1)
+    f, args = arrays_only(f, args, is_parameter)
     t0, t1 = checks.interval(t0, t1)
     dts = _positive_values("dts", dts, "s")
     if not dts:

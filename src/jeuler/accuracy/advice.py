@@ -10,6 +10,7 @@ import numpy as np
 
 from jeuler._core import checks
 from jeuler._core.component import result
+from jeuler._core.partition import arrays_only
 from jeuler._core.precision import flat
 from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
@@ -108,6 +109,7 @@ def advise_step(
     checks.untraced("advise_step", y0, args, t0, t1, error)
     t0, t1 = checks.interval(t0, t1)
     checks.positive("error", error)
+    f, args = arrays_only(f, args)
     checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if max_pilot_steps is None:
         max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))

@@ -82,7 +82,8 @@ def fit(
 
     Args:
       residual: ``residual(params)``, a pytree of floating arrays, model minus data in the unit of the data.
-      params: starting values, any pytree of floating arrays.
+      params: starting values, any pytree. Its floating arrays are fitted; functions, strings and integers in it, as
+        in a neural network, stay.
       positive: which parameters must stay positive: one bool, or a tree of bools that is a prefix of params.
       scale: a sensible step of each parameter that is not positive, one number or a prefix tree; None takes its size.
       optimizer: None for Levenberg-Marquardt (``optax.lbfgs()`` where its Jacobian would not fit in a gigabyte), or
@@ -182,6 +183,8 @@ def _report(
     parts = ["converged" if converged else "stopped before it converged: allow more iterations or start closer"]
     if seen.nonfinite:
         parts.append(f"stepped back from {seen.nonfinite} points that were not finite")
+    if unknowns.kept:
+        parts.append(f"{', '.join(unknowns.kept)} kept as given, an integer; write a float to fit it")
     if undetermined:
         shown = ", ".join(undetermined[:6]) + (", ..." if len(undetermined) > 6 else "")
         parts.append(f"the data do not determine {shown}")

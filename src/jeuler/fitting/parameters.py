@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._core.component import replace
+from jeuler._core.component import Partitioned, replace
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
@@ -24,6 +24,7 @@ def _free(state: ParticleState) -> np.ndarray:
 
 def _fields(force: Any) -> set[str]:
     """The names of a force's parameters."""
+    force = force.whole() if isinstance(force, Partitioned) else force
     if not dataclasses.is_dataclass(force):
         return set()
     return {field.name for field in dataclasses.fields(force)} - {"edges", "function"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
-from jeuler._core.component import Function
+from jeuler._core.component import unwrapped
 from jeuler.particles.state import ParticleState, with_default_fields
 
 F = TypeVar("F", bound=Callable)
@@ -51,11 +51,11 @@ def uses(
 
 def declared(part: Any, what: str, default: Any = ()) -> Any:
     """What a force or effect says of itself: the fields it ``reads``, ``writes`` or ``sets``, or another attribute."""
-    return getattr(part.function if isinstance(part, Function) else part, what, default)
+    return getattr(unwrapped(part), what, default)
 
 
 def name_of(part: Any) -> str:
-    part = part.function if isinstance(part, Function) else part
+    part = unwrapped(part)
     return getattr(part, "__name__", type(part).__name__)
 
 

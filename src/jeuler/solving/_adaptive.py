@@ -12,6 +12,7 @@ from jax import Array, lax
 
 from jeuler._core import checks, trees
 from jeuler._core.component import component
+from jeuler._core.partition import arrays_only
 from jeuler.solving._tables import adaptive_table
 from jeuler.steps.explicit import VectorField
 from jeuler.steps.extrapolated import ExtrapolatedStep, extrapolated_euler
@@ -104,6 +105,7 @@ def solve_adaptive(
     t0 = jnp.asarray(t0, times.dtype)
     if not checks.is_traced(times) and not checks.is_traced(t0) and not np.all(np.diff(times, prepend=t0) > 0):
         raise ValueError(f"t1 must be later than t0={float(t0)} and increase, got {times.tolist()}")
+    f, args = arrays_only(f, args)
     checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)

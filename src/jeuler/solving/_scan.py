@@ -14,6 +14,7 @@ from jax import Array, lax
 
 from jeuler._core import checks, trees
 from jeuler._core.component import component
+from jeuler._core.partition import arrays_only
 from jeuler._jax.members import recomputed
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
@@ -74,7 +75,8 @@ def solve(
       dt: step size, > 0, s. Differentiable.
       num_steps: number of steps, an integer >= 0.
       t0: initial time, s. Differentiable.
-      args: passed to f; any pytree. Differentiable.
+      args: passed to f; any pytree. Its arrays and floats are differentiable; other leaves, such as functions, strings
+        and integers, stay as they are.
       step: the method: `euler_step`, `symplectic_euler_step`, `heun_step`, `rk4_step` or any such function.
       save_every: save each save_every-th step; must divide num_steps.
       save: ``save(t, y)`` makes what is kept of a saved state; None keeps y.
@@ -100,6 +102,7 @@ def solve(
     y0 = checks.state("y0", y0)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0))
     checks.function("f", f, "(t, y, args) -> dy/dt", "args is there even if f does not need it")
+    f, args = arrays_only(f, args)
     checks.same_form("the vector field f", y0, jax.eval_shape(f, grid.t0, y0, args))
     if checkpoint == "reversible":
         return solve_reversibly(f, y0, args, grid, save, step, compensated)

@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jeuler._core import checks, trees
+from jeuler._core.partition import arrays_only
 from jeuler._core.precision import cast, double_precision
 from jeuler.steps.amplification import pair_limits, scalar_limits, treats_all_alike
 from jeuler.steps.explicit import Step, VectorField, euler_step
@@ -78,6 +79,7 @@ def stability_limit(
     checks.untraced("stability_limit", t, y, args)
     checks.number("t", t)
     y = checks.state("y", y)
+    f, args = arrays_only(f, args)
     checks.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
     with double_precision():
         linear = Linearisation(f, y, args)
