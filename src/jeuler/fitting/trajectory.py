@@ -1,17 +1,16 @@
-"""Measured trajectories from text files, as labs and phones export them."""
+"""Measured trajectories, as phones, cameras, loggers and spreadsheets export them."""
 
 from __future__ import annotations
 
-import csv
-import os
-import re
-from typing import NamedTuple
+import warnings
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jeuler._core.describe import object_table, summary
-
-MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
+from jeuler.fitting.recordings.reading import read_table
+from jeuler.fitting.recordings.recording import Recording, longest, understand
+from jeuler.fitting.recordings.table import listed
 
 
 class Trajectory(NamedTuple):
@@ -19,7 +18,7 @@ class Trajectory(NamedTuple):
 
     Attributes:
       times: the time column, (row,), as the file has it.
-      columns: every other column by name, in the file's order, (row,) each; NaN = missing cell.
+      columns: the columns of the same run by name, in the file's order, (row,) each; NaN = missing cell.
     Example:
       >>> import numpy as np, jeuler
       >>> swing = jeuler.Trajectory(np.array([0.0, 0.1]), {"x": np.array([1.0, 0.9])})
@@ -38,146 +37,68 @@ class Trajectory(NamedTuple):
         return object_table(self)
 
 
-def read_trajectory(path: str | os.PathLike[str], *, time: str | None = None) -> Trajectory:
-    """Read times and columns from a CSV or TSV file.
+def read_trajectory(
+    path: Any, *, time: str | None = None, run: str | int | None = None, si: bool = False, skip: int = 0
+) -> Trajectory:
+    """Read times and columns from a recording as it was exported.
 
-    Commas, semicolons, tabs or blanks separate; header names or none (a ``# columns: t,x`` comment names them too);
-    lines that begin with # are comments; decimal commas where the comma does not separate; an empty cell, nan or NA
-    is missing.
+    Text with commas, semicolons, tabs or blanks between cells, decimal points or commas, in UTF-8, UTF-16 or Latin-1;
+    title lines, names (in a comment too), a row of units; empty cells, NA, #N/A and the like are missing; dates and
+    times of day become seconds. Runs side by side (each with a time column) and stacked (the clock starts again) are
+    told apart. Excel workbooks are read by pandas (``pip install 'jeuler[io]'``), MATLAB files by scipy.
 
     Args:
-      path: the file.
-      time: name of the time column; None takes the column named t or time, or else the first.
+      path: a path, an open file, or a pandas or polars frame. A ``.gz`` file, or a zip file of one table, is unpacked.
+      time: name of the time column; None takes the one that is named as a time, or else the first.
+      run: which run, "1", "2", ...; None takes the longest.
+      si: convert to seconds, metres, m/s^2, radians by the units in the names. False leaves numbers as the file has
+        them and warns where they are in other units.
+      skip: how many lines at the top of a text to leave out.
     Returns: `Trajectory`, ``times`` and ``columns``, float64.
     Raises: ValueError, one line with file, line and column, for what cannot be read; OSError, if there is no file.
     Example:
       >>> import pathlib, tempfile, jeuler
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "swing.csv"
-      >>> _ = path.write_text("time;x\\n0,0;1,5\\n0,1;\\n")
-      >>> times, columns = jeuler.read_trajectory(path)
-      >>> times.tolist(), columns["x"].tolist()
-      ([0.0, 0.1], [1.5, nan])
+      >>> _ = path.write_text("time (ms);x (mm)\\n0,0;1,5\\n100,0;\\n")
+      >>> times, columns = jeuler.read_trajectory(path, si=True)
+      >>> times.tolist(), columns["x (mm)"].tolist()
+      ([0.0, 0.1], [0.0015, nan])
 
-    Source: RFC 4180 for quotes; the rest is what spreadsheets and phone apps write.
+    Source: RFC 4180 for quotes.
     """
-    name = os.fspath(path)
-    comments, lines = _lines(name)
-    if not lines:
-        raise ValueError(f"{name}: no data, expected rows of a time and at least one value")
-    separator = _separator([line for _, line in lines[:50]])
-    rows = [(number, _cells(line, separator)) for number, line in lines]
-    header: list[str] | None = None
-    while rows and not any(_is_number(cell) for cell in rows[0][1]):
-        if header is None:
-            header = rows[0][1]
-        rows = rows[1:]
-    if not rows:
-        raise ValueError(f"{name}: line {lines[0][0]}: only names and no numbers, expected rows of numbers")
-    width = len(rows[0][1]) if header is None else len(header)
-    if width < 2:
-        raise ValueError(
-            f"{name}: line {rows[0][0]}: one column, expected a time and at least one value, "
-            f"separated by commas, semicolons, tabs or blanks"
+    table = read_table(path, skip)
+    recordings = understand(table, time, ordered=False)
+    recording = chosen_run(recordings, None if run is None else str(run))
+    others = [other.run for other in recordings if other is not recording]
+    if others and run is None:
+        warnings.warn(
+            f"{table.source}: {len(recordings)} runs; run {recording.run} with the most rows was read, "
+            f"run={others[0]!r} reads another",
+            stacklevel=2,
         )
-    names = _names(header or _commented_names(comments, width), width)
-    table = np.array([_numbers(name, number, cells, names) for number, cells in rows])
-    clock = _time_column(name, names, time)
-    lost = np.flatnonzero(np.isnan(table[:, clock]))
-    if lost.size:
-        raise ValueError(f"{name}: line {rows[lost[0]][0]}: column {clock + 1} ({names[clock]}): the time is missing")
-    columns = {names[k]: table[:, k] for k in range(width) if k != clock}
-    return Trajectory(table[:, clock], columns)
+    kept = [(k, column) for k, column in enumerate(recording.columns) if column.quantity != "text"]
+    if si:
+        return Trajectory(recording.times, {column.name: recording.values[:, k] for k, column in kept})
+    clock = recording.clock
+    foreign = [column.name for column in (clock, *(column for _, column in kept)) if abs(column.factor - 1) > 0]
+    if foreign:
+        warnings.warn(
+            f"{table.source}: {listed(foreign)}: numbers are in the units of the file; "
+            f"si=True converts them to s, m, m/s^2, rad",
+            stacklevel=2,
+        )
+    begin, end = recording.rows
+    times = recording.times if clock.unit == "date" else table.values[begin:end, clock.index]
+    return Trajectory(times, {column.name: table.values[begin:end, column.index] for _, column in kept})
 
 
-def _lines(name: str) -> tuple[list[str], list[tuple[int, str]]]:
-    """Comment texts, and the other lines that are not blank with their numbers from 1."""
-    with open(name, "rb") as file:
-        raw = file.read()
-    if b"\0" in raw:
-        raise ValueError(f"{name}: not a text file; save it as comma-separated text (CSV) in UTF-8")
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
-    numbered = [(number, line.strip("\r\n")) for number, line in enumerate(text.splitlines(), start=1)]
-    comments = [line.lstrip()[1:].strip() for _, line in numbered if line.lstrip().startswith("#")]
-    return comments, [(n, line) for n, line in numbered if line.strip() and not line.lstrip().startswith("#")]
-
-
-def _separator(lines: list[str]) -> str:
-    """The first of semicolon, tab, comma that most lines have; else blanks."""
-    for candidate in (";", "\t", ","):
-        if sum(candidate in line for line in lines) > len(lines) / 2:
-            return candidate
-    return " "
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    if separator == " ":
-        return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
-
-
-def _number(cell: str) -> float:
-    """The value of a cell; ValueError if it is not a finite number."""
-    if cell.lower() in MISSING:
-        return float("nan")
-    if "," in cell and "." not in cell:
-        cell = cell.replace(",", ".")
-    if "_" in cell or not np.isfinite(value := float(cell)):
-        raise ValueError
-    return value
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        return not np.isnan(_number(cell))
-    except ValueError:
-        return False
-
-
-def _numbers(name: str, line: int, cells: list[str], names: list[str]) -> list[float]:
-    while len(cells) > len(names) and not cells[-1]:
-        cells = cells[:-1]  # a separator at the end of the line
-    if len(cells) != len(names):
-        raise ValueError(f"{name}: line {line}: {len(cells)} cells, expected {len(names)}: {', '.join(names)}")
-    values = []
-    for k, cell in enumerate(cells):
-        try:
-            values.append(_number(cell))
-        except ValueError:
-            raise ValueError(
-                f"{name}: line {line}: column {k + 1} ({names[k]}): expected a number, got {cell!r}"
-            ) from None
-    return values
-
-
-def _commented_names(comments: list[str], width: int) -> list[str] | None:
-    """Names from a comment such as ``# columns: t_s,x_m``, if it has as many as the table is wide."""
-    for comment in comments:
-        found = re.match(r"columns?\s*:\s*(.*)", comment, re.IGNORECASE)
-        names = re.split(r"[,;\s]+", found.group(1).strip()) if found else []
-        if len(names) == width:
-            return names
-    return None
-
-
-def _names(header: list[str] | None, width: int) -> list[str]:
-    """Column names, every one different and none empty."""
-    given = header or [""] * width
-    names: list[str] = []
-    for k, name in enumerate(given):
-        name = name or ("t" if k == 0 and header is None else f"column{k + 1}")
-        names.append(name if name not in names else f"{name}_{k + 1}")
-    return names
-
-
-def _time_column(name: str, names: list[str], time: str | None) -> int:
-    if time is not None:
-        if time not in names:
-            raise ValueError(f"{name}: no column {time!r} for the time, the columns are {', '.join(names)}")
-        return names.index(time)
-    for k, column in enumerate(names):
-        if re.match(r"(t|time)\b|t_", column.strip().lower()):
-            return k
-    return 0
+def chosen_run(recordings: list[Recording], run: str | None) -> Recording:
+    """The run of that label, the longest for None."""
+    if run is None:
+        return longest(recordings)
+    for recording in recordings:
+        if recording.run == run.strip().removeprefix("#"):
+            return recording
+    raise ValueError(
+        f"{recordings[0].source}: no run {run!r}, there are {', '.join(recording.run for recording in recordings[:20])}"
+    )
