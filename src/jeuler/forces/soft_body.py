@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from jeuler._core import checks
 from jeuler._core.component import Parameter, component, replace, store_as_float
@@ -34,11 +35,31 @@ def _rotation_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
 
 
 def turning(s: Array, skew: Array) -> Array:
-    """The antisymmetric W with S W + W S = skew, for a symmetric S; finite also for a collapsed body, S = 0."""
-    one = jnp.eye(len(s), dtype=s.dtype)
-    small = jnp.finfo(s.dtype).eps * (1 + jnp.abs(jnp.trace(s)))
-    both_sides = jnp.kron(s, one) + jnp.kron(one, s.T) + small * jnp.kron(one, one)
-    return jnp.linalg.solve(both_sides, skew.reshape(-1)).reshape(s.shape)
+    """The antisymmetric W with S W + W S = skew, for a symmetric S, from its dim (dim - 1) / 2 unknowns alone.
+
+        1/2 sum_kl (S W + W S)_kl B^a_kl = 1/2 sum_kl skew_kl B^a_kl,   W = sum_a w_a B^a,   B^a an antisymmetric basis
+
+    In three dimensions the matrix of this equation is tr(S) I - S, the tensor of inertia, in two it is tr(S). It is
+    singular where nothing tells the turning: a straight body about its line, a collapsed one about everything. The
+    unknowns there are near 0 then: a small multiple of I is added, and its effect on the others removed by one step
+    of iterative refinement.
+    """
+    basis = _antisymmetric_basis(len(s), s.dtype)
+    matrix = jnp.einsum("akl,bkl->ab", basis, basis @ s + s @ basis) / 2
+    right = jnp.einsum("akl,kl->a", basis, skew) / 2
+    small = jnp.finfo(s.dtype).eps ** (2 / 3) * jnp.abs(jnp.trace(s)) + jnp.finfo(s.dtype).tiny ** 0.5
+    safe = matrix + small * jnp.eye(len(basis), dtype=s.dtype)
+    w = jnp.linalg.solve(safe, right)
+    w = w + jnp.linalg.solve(safe, right - matrix @ w)
+    return jnp.einsum("a,akl->kl", w, basis)
+
+
+def _antisymmetric_basis(dim: int, dtype: Any) -> Array:
+    """(dim (dim - 1) / 2, dim, dim), each with one entry 1 below the diagonal and -1 above it."""
+    basis = np.zeros((dim * (dim - 1) // 2, dim, dim))
+    for a, (k, l) in enumerate(itertools.combinations(range(dim), 2)):
+        basis[a, l, k], basis[a, k, l] = 1, -1
+    return jnp.asarray(basis, dtype)
 
 
 @component(static=("particles",), positive=("stiffness", "damping"))
@@ -50,6 +71,11 @@ class ShapeMatching:
 
     with q the rest shape about its own mean and W the turning of the body as it is, by least squares. The forces sum
     to zero and have no torque. A collapsed or inverted body finds back.
+
+    Differentiable wherever one rotation is nearest: in flat bodies too (in two dimensions straight ones). Not
+    differentiable, with derivatives that are finite and leave the undetermined turning out, where several are equally
+    near: a body that has collapsed to a point, in three dimensions to a line, and an inverted one whose two smallest
+    extents are equal.
 
     Args:
       particles: indices of the body, integers (body particle,). Static.
@@ -94,8 +120,12 @@ class ShapeMatching:
             return here * (x - jnp.sum(here * x, axis=0) / jnp.maximum(jnp.sum(here), 1))
 
         p, v, q = (about_mean(x) for x in (position[body], velocity[body], self.rest_position.astype(dtype)))
-        turn = turning(p.T @ p, v.T @ p - p.T @ v)
-        to_goal, to_rigid = q @ rotation_of(p.T @ q).T - p, p @ turn.T - v
+        # a body within rounding of one point has no turning: its derivative there would be that of the rounding
+        extent = 32 * jnp.finfo(dtype).eps * jnp.max(jnp.abs(position[body]), initial=0)
+        a = jnp.where(jnp.max(jnp.abs(p), initial=0) > extent, p.T @ q, lax.stop_gradient(p.T @ q))
+        arm = jnp.where(jnp.max(jnp.abs(p), initial=0) > extent, p, 0)
+        turn = turning(arm.T @ arm, v.T @ arm - arm.T @ v)
+        to_goal, to_rigid = q @ rotation_of(a).T - p, p @ turn.T - v
         force = self.stiffness.astype(dtype) * to_goal + self.damping.astype(dtype) * to_rigid
         return jnp.zeros_like(position).at[body].add(force)
 
