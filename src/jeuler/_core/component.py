@@ -14,7 +14,6 @@ from jax.typing import ArrayLike
 from jeuler._core.describe import object_table, summary
 from jeuler._core.partition import Rest, is_parameter, partition
 
-Parameter = Any  # of a component: a number, list or array as passed, a floating array as kept
 T = TypeVar("T")
 
 _PARAMETERS: dict[type, dict[str, bool]] = {}  # of each class of components: name, whether positive

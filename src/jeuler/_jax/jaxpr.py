@@ -12,7 +12,7 @@ Jaxpr = Any
 Primitive: Any = type(lax.add_p)
 
 
-def evaluate(jaxpr: Jaxpr, operands: Sequence) -> list:
+def evaluate(jaxpr: Jaxpr, operands: Sequence[Any]) -> list[Any]:
     """The results of a closed jaxpr."""
     return jax.core.eval_jaxpr(jaxpr.jaxpr, jaxpr.consts, *operands)
 

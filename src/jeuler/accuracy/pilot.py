@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,6 +23,10 @@ SAMPLES = 8  # states kept of a pilot run, at which its stability is looked at
 
 class Pilot:
     """Runs of one step on one problem; the number of steps is an input of the program, not a part of it."""
+
+    dtype: Any
+    interval: float
+    program: Callable[..., Any]
 
     def __init__(
         self,

@@ -186,7 +186,9 @@ def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
     return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
 
 
-def evaluations(plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree) -> list[Callable]:
+def evaluations(
+    plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree
+) -> list[Callable[..., Any]]:
     """For each run of one method, evaluations of f as a function of the steps it took; counted while steps are taken.
 
     A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and scaled to

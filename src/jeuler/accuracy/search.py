@@ -30,6 +30,24 @@ ROUGH = 2**18  # steps of the longest run in float32
 class Search:
     """Pilot runs of one step on one problem, looking for the fewest steps whose error meets the target."""
 
+    f: VectorField
+    start: PyTree
+    t0: float
+    t1: float
+    args: PyTree
+    step: Step
+    error: float
+    relative: bool
+    compensated: bool
+    most: int
+    interval: float
+    order: int
+    dtype: Any
+    linear: Linearisation
+    pilot: Pilot
+    stability: float
+    bound: float
+
     def __init__(
         self,
         f: VectorField,

@@ -116,7 +116,7 @@ class WorkPrecision:
             found.append(Summary(method, dtype, order, floor, floor_dt, limit))
         return found
 
-    def to_csv(self, path: str | os.PathLike) -> None:
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
         """Write every row, every column; repeats separated by spaces."""
         with open(path, "w", newline="") as file:
             writer = csv.DictWriter(file, list(EMPTY_ROW))

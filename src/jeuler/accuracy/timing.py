@@ -60,7 +60,7 @@ def measure(
     return Measurement(result, compile_seconds, runs, getattr(memory, "temp_size_in_bytes", -1))
 
 
-def counting(f: Callable) -> tuple[Callable, Callable[[], int]]:
+def counting(f: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[[], int]]:
     """f, counting its evaluations as they run (those of loops that end by a test too), and how to read and reset it."""
     count = 0
 

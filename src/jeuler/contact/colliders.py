@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
+from jeuler._core.annotations import MovingParameter, Parameter
 from jeuler._core.component import as_component, component, store_as_float
 from jeuler._core.in_time import at_time
 from jeuler._core.vectors import length, unit
@@ -76,8 +77,8 @@ class Plane(_Shape):
     Source: C. Ericson, Real-Time Collision Detection, 2005, sect. 5.1.1.
     """
 
-    point: Any
-    normal: Array
+    point: MovingParameter
+    normal: Parameter
 
     def __call__(self, t: Any, point: Array) -> Array:
         return (point - at_time(self.point, t, point.dtype)) @ unit(self.normal.astype(point.dtype))
@@ -103,8 +104,8 @@ class Sphere(_Shape):
     Source: C. Ericson, Real-Time Collision Detection, 2005, sect. 5.2.
     """
 
-    center: Any
-    radius: Array
+    center: MovingParameter
+    radius: Parameter
     inside: bool = False
 
     def __call__(self, t: Any, point: Array) -> Array:
@@ -131,8 +132,8 @@ class Box(_Shape):
     Source: I. Quilez, Distance functions, iquilezles.org, 2008 (box, exact).
     """
 
-    center: Any
-    half_size: Array
+    center: MovingParameter
+    half_size: Parameter
 
     def __call__(self, t: Any, point: Array) -> Array:
         q = jnp.abs(point - at_time(self.center, t, point.dtype)) - self.half_size.astype(point.dtype)

@@ -10,7 +10,8 @@ import numpy as np
 from jax import lax
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, as_component, component, store_as_float
+from jeuler._core.annotations import ColliderLike, Parameter, default
+from jeuler._core.component import as_component, component, store_as_float
 from jeuler.contact.colliders import check_collider
 from jeuler.contact.impacts import Impacts, Path
 
@@ -48,11 +49,11 @@ class Collisions:
       DiffTaichi, ICLR 2020, sect. 4 (time of impact).
     """
 
-    colliders: tuple = ()
+    colliders: tuple[ColliderLike, ...] = ()
     pairs: tuple[tuple[int, int], ...] = ()
-    radius: Parameter = 0.0
-    restitution: Parameter = 0.0
-    friction: Parameter = 0.0
+    radius: Parameter = default(0.0)
+    restitution: Parameter = default(0.0)
+    friction: Parameter = default(0.0)
     max_bounces: int = 3
 
     def __post_init__(self) -> None:

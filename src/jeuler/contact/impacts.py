@@ -43,6 +43,17 @@ class Path(NamedTuple):
 class Impacts:
     """The impacts of one step of length dt from t0, for one `Collisions`."""
 
+    t0: Array
+    dt: Array
+    colliders: tuple[Collider, ...]
+    restitution: Array
+    friction: Array
+    radius: Array
+    inverse_mass: Array
+    i: np.ndarray
+    j: np.ndarray
+    both_alive: Any
+
     def __init__(self, contact: Any, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None) -> None:
         self.t0, self.dt = t0.astype(x.dtype), dt.astype(x.dtype)
         self.colliders = contact.colliders

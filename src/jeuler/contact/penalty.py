@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, as_component, component, store_as_float
+from jeuler._core.annotations import ColliderParameter, Parameter, default
+from jeuler._core.component import as_component, component, store_as_float
 from jeuler.contact.colliders import check_collider, normal_and_speed
 
 
@@ -38,10 +39,10 @@ class PenaltyContact:
     Source: M. Moore, J. Wilhelms, Collision Detection and Response for Computer Animation, SIGGRAPH 1988, sect. 3.1.
     """
 
-    collider: Any
-    ks: Array
-    kd: Parameter = 0.0
-    radius: Parameter = 0.0
+    collider: ColliderParameter
+    ks: Parameter
+    kd: Parameter = default(0.0)
+    radius: Parameter = default(0.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "collider", as_component(self.collider))

@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
+from jeuler._core.annotations import OptionalParameter, Parameter, default
 from jeuler._core.component import component, store_as_float
 from jeuler._core.components import per_particle
 from jeuler._core.vectors import direction
@@ -42,9 +43,9 @@ class OverLife:
     """
 
     field: str
-    values: Array
-    times: Array | None = None
-    duration: Array | None = None
+    values: Parameter
+    times: OptionalParameter = default(None)
+    duration: OptionalParameter = default(None)
 
     def __post_init__(self) -> None:
         if self.field == "shape":
@@ -128,7 +129,7 @@ class SpeedLimit:
     Source: C. W. Reynolds, Steering Behaviors for Autonomous Characters, 1999, "Simple Vehicle Model".
     """
 
-    limit: Array
+    limit: Parameter
 
     def __post_init__(self) -> None:
         store_as_float(self, "limit")

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core import checks, trees
-from jeuler._core.component import Parameter, as_component, component, store_as_float
+from jeuler._core.annotations import ColliderParameter, OptionalParameter, Parameter, SampledParameter, default
+from jeuler._core.component import as_component, component, store_as_float
 from jeuler._core.components import by_component
 from jeuler.particles.state import COUNTERS, DEFAULTS
 from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
@@ -53,19 +54,19 @@ class Emitter:
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.1-2.2.
     """
 
-    rate: Array
-    position: Any
-    velocity: Any
-    lifetime: Any = None
-    mass: Any = None
-    color: Any = None
-    opacity: Any = None
-    size: Any = None
-    shape: Any = None
+    rate: Parameter
+    position: SampledParameter
+    velocity: SampledParameter
+    lifetime: SampledParameter = default(None)
+    mass: SampledParameter = default(None)
+    color: SampledParameter = default(None)
+    opacity: SampledParameter = default(None)
+    size: SampledParameter = default(None)
+    shape: SampledParameter = default(None)
     extra: dict[str, Any] | None = None
     bursts: tuple[tuple[float, int], ...] = ()
-    start: Parameter = 0.0
-    stop: Parameter = jnp.inf
+    start: Parameter = default(0.0)
+    stop: Parameter = default(jnp.inf)
     max_births: int | None = None
 
     before_motion = True
@@ -209,11 +210,11 @@ class Lifetime:
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.4.
     """
 
-    duration: Array | None = None
+    duration: OptionalParameter = default(None)
 
     before_motion = True
-    sets = ("age",)
-    writes = ("alive",)
+    sets: ClassVar[tuple[str, ...]] = ("age",)
+    writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
         if self.duration is not None:
@@ -254,7 +255,7 @@ class Death:
     condition: Callable[[Any, Any], Array]
 
     before_motion = True
-    writes = ("alive",)
+    writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
         return state.replace(alive=state.alive & ~self.condition(t, state))
@@ -280,11 +281,11 @@ class DeathOutside:
       sect. 2 (particle extinction).
     """
 
-    low: Array
-    high: Array
+    low: Parameter
+    high: Parameter
 
     before_motion = True
-    writes = ("alive",)
+    writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
         store_as_float(self, "low", "high")
@@ -321,11 +322,11 @@ class DeathOnContact:
       sect. 2 (particle extinction).
     """
 
-    collider: Any
-    margin: Parameter = 0.0
+    collider: ColliderParameter
+    margin: Parameter = default(0.0)
 
     before_motion = True
-    writes = ("alive",)
+    writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "collider", as_component(self.collider))

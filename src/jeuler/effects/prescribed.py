@@ -10,7 +10,8 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, as_component, component, replace, store_as_float
+from jeuler._core.annotations import MovingParameter, Parameter, ParticleIndices
+from jeuler._core.component import as_component, component, replace, store_as_float
 from jeuler._core.interpolate import interpolate, slopes
 
 
@@ -76,8 +77,8 @@ class PrescribedMotion:
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 4 (user interaction).
     """
 
-    particles: Any
-    path: Any
+    particles: ParticleIndices
+    path: MovingParameter
 
     def __post_init__(self) -> None:
         particles = tuple(int(k) for k in np.asarray(self.particles).ravel())

@@ -44,6 +44,11 @@ class LeastSquares:
     loss(z) = sum_k w_k r_k(z)^2 / count,   w_k = 1 for what counts, 0 for what does not count yet
     """
 
+    evaluate: Callable[..., Any]
+    value_and_grad: Callable[..., Any]
+    objective: Callable[..., Any]
+    linearise: Callable[..., Any]
+
     def __init__(self, residual: Callable[[Array], Array], size: int) -> None:
         self.size = size
         self.evaluate = jax.jit(lambda z, w: self._losses(residual(z), w))

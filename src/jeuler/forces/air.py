@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler._core.component import Parameter, as_component, component, store_as_float
+from jeuler._core.annotations import MovingParameter, Parameter, default
+from jeuler._core.component import as_component, component, store_as_float
 from jeuler._core.in_time import at_time, moving
 
 
@@ -22,12 +23,12 @@ def as_air(air: Any) -> Any:
     return (as_component(air) if callable(air) else Wind(air),)
 
 
-def air_velocity(air: tuple, t: Any, position: Array) -> Array | float:
+def air_velocity(air: tuple[Any, ...], t: Any, position: Array) -> Array | float:
     """The sum of the fields at each particle; 0 where there is none."""
     return sum((part(t, position) for part in air), start=0.0)
 
 
-def check_air(name: str, air: tuple, particles: int, dim: int) -> None:
+def check_air(name: str, air: tuple[Any, ...], particles: int, dim: int) -> None:
     """Each field of the air gives a velocity of the right dimension."""
     t, position = jnp.zeros(()), jnp.zeros((particles, dim))
     for part in air:
@@ -60,7 +61,7 @@ class Wind:
     Source: J. Wejchert, D. Haumann, Animation Aerodynamics, SIGGRAPH 1991 (flow primitives).
     """
 
-    velocity: Any
+    velocity: MovingParameter
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "velocity", moving(self.velocity))
@@ -88,8 +89,8 @@ class Gust:
     Source: F. M. Hoblit, Gust Loads on Aircraft: Concepts and Applications, 1988 (the one-minus-cosine gust).
     """
 
-    velocity: Array
-    period: Array
+    velocity: Parameter
+    period: Parameter
 
     def __post_init__(self) -> None:
         store_as_float(self, "velocity", "period")
@@ -125,13 +126,13 @@ class Turbulence:
     Source: R. H. Kraichnan, Diffusion by a random velocity field, Physics of Fluids 13, 1970.
     """
 
-    speed: Array
-    size: Array
-    time: Array
-    waves: Array
-    amplitudes: Array
-    phases: Array
-    frequencies: Array
+    speed: Parameter
+    size: Parameter
+    time: Parameter
+    waves: Parameter
+    amplitudes: Parameter
+    phases: Parameter
+    frequencies: Parameter
 
     def __post_init__(self) -> None:
         store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
@@ -200,10 +201,10 @@ class Vortex:
     Source: H. Lamb, Hydrodynamics, 6th ed., 1932, sect. 334a (the Lamb-Oseen vortex).
     """
 
-    center: Any
-    circulation: Array
-    core: Array
-    axis: Parameter = (0.0, 0.0, 1.0)
+    center: MovingParameter
+    circulation: Parameter
+    core: Parameter
+    axis: Parameter = default((0.0, 0.0, 1.0))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving(self.center))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
+from jeuler._core.annotations import MovingParameter, Parameter
 from jeuler._core.component import component, store_as_float
 from jeuler._core.components import mass_that_feels, per_particle
 from jeuler._core.in_time import at_time, moving
@@ -39,9 +40,9 @@ class PointAttractor:
     Source: H. C. Plummer, On the problem of distribution in globular star clusters, 1911 (the softening).
     """
 
-    center: Any
-    strength: Any
-    softening: Array
+    center: MovingParameter
+    strength: MovingParameter
+    softening: Parameter
     power: float = 2
 
     def __post_init__(self) -> None:

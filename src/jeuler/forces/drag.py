@@ -8,12 +8,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.annotations import AirParameter, OptionalParameter, Parameter, default
+from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.components import by_component, split, stack
 from jeuler.forces.air import air_velocity, as_air, check_air
 
 
-def through_air(air: tuple, t: Any, position: Array, velocity: Array) -> Array:
+def through_air(air: tuple[Any, ...], t: Any, position: Array, velocity: Array) -> Array:
     """The velocity of each particle relative to the air, (particle, dim)."""
     return by_component(jnp.subtract, velocity, jnp.asarray(air_velocity(air, t, position))) if air else velocity
 
@@ -53,9 +54,9 @@ class LinearDrag:
     Source: G. G. Stokes, On the effect of the internal friction of fluids on the motion of pendulums, 1851.
     """
 
-    coefficient: Array
-    air: Any = None
-    longest_step: Array | None = None
+    coefficient: Parameter
+    air: AirParameter = default(None)
+    longest_step: OptionalParameter = default(None)
 
     def __post_init__(self) -> None:
         store_as_float(self, "coefficient")
@@ -101,8 +102,8 @@ class QuadraticDrag:
     """
 
     coefficient: Parameter
-    air: Any = None
-    longest_step: Parameter = None
+    air: AirParameter = default(None)
+    longest_step: OptionalParameter = default(None)
 
     def __post_init__(self) -> None:
         store_as_float(self, "coefficient")

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, store_as_float
+from jeuler._core.annotations import Parameter
+from jeuler._core.component import component, store_as_float
 from jeuler._core.components import mass_that_feels, stack
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks
+from jeuler._core.annotations import OptionalParameter, Parameter, ParticleIndices, default
 from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.indices import Indices
 from jeuler._core.vectors import direction
@@ -136,12 +137,12 @@ class StrandBending(_OnStrands):
       sect. 3.2.
     """
 
-    strands: Any
-    rest_position: Array
-    stiffness: Array
-    damping: Array
-    smoothing: Array
-    here: Array | None = None
+    strands: ParticleIndices
+    rest_position: Parameter
+    stiffness: Parameter
+    damping: Parameter
+    smoothing: Parameter
+    here: OptionalParameter = default(None)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         nodes = np.asarray(self.strands)
@@ -187,12 +188,12 @@ class StrandCore(_OnStrands):
       sect. 3.3.
     """
 
-    strands: Any
-    rest_position: Array
-    stiffness: Array
-    damping: Array
-    smoothing: Array
-    here: Array | None = None
+    strands: ParticleIndices
+    rest_position: Parameter
+    stiffness: Parameter
+    damping: Parameter
+    smoothing: Parameter
+    here: OptionalParameter = default(None)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         nodes = np.asarray(self.strands)

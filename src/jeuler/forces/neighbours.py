@@ -9,7 +9,8 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.annotations import Parameter, ParticleIndices, default
+from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.indices import Indices
 from jeuler._core.vectors import direction
 from jeuler.graphs.topology import Topology
@@ -37,8 +38,8 @@ class Viscosity:
     Source: D. Terzopoulos, J. Platt, K. Fleischer, Heating and melting deformable models, 1991.
     """
 
-    edges: Topology
-    coefficient: Array
+    edges: ParticleIndices
+    coefficient: Parameter
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
@@ -90,9 +91,9 @@ class Bending:
     Source: M. Bergou et al., Discrete Elastic Rods, ACM Transactions on Graphics 27, 2008, sect. 4.2 (turning angle).
     """
 
-    triples: Any
-    stiffness: Array
-    rest_angle: Parameter = 0.0
+    triples: ParticleIndices
+    stiffness: Parameter
+    rest_angle: Parameter = default(0.0)
 
     def __post_init__(self) -> None:
         triples = np.asarray(self.triples)

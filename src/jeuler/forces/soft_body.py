@@ -11,7 +11,8 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.annotations import OptionalParameter, Parameter, ParticleIndices, default
+from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.indices import Indices
 
 
@@ -96,11 +97,11 @@ class ShapeMatching:
     Source: M. Mueller, B. Heidelberger, M. Teschner, M. Gross, Meshless Deformations Based on Shape Matching, 2005.
     """
 
-    particles: Any
-    rest_position: Array
-    stiffness: Array
-    damping: Parameter = 0.0
-    here: Array | None = None
+    particles: ParticleIndices
+    rest_position: Parameter
+    stiffness: Parameter
+    damping: Parameter = default(0.0)
+    here: OptionalParameter = default(None)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "particles", Indices(np.asarray(self.particles).reshape(-1)))

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.annotations import Parameter, ParticleIndices
+from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.components import split, stack
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
@@ -83,7 +84,7 @@ class Springs:
     Source: D. Baraff, A. Witkin, Physically Based Modeling, SIGGRAPH course notes, 2001, particle systems, sect. 3.
     """
 
-    edges: Any
+    edges: ParticleIndices
     ks: Parameter
     kd: Parameter
     rest_length: Parameter

@@ -5,7 +5,7 @@
 A force between pairs is B^T g(B x, B v). With B and B^T linear primitives, each the transpose of the other,
 every derivative of it, forward, reverse, of any order, under vmap or not, is again made of B and B^T.
 
-How they are computed is the matter of a layout (see `jeuler.forces.layouts`), a static parameter of both.
+How they are computed is up to a layout (see `jeuler.graphs.layouts`), a static parameter of both.
 Operands: an array (..., particle) or (..., *slots), then the layout's tables. Leading axes are batches.
 """
 
@@ -21,8 +21,8 @@ from jax.interpreters import ad, batching, mlir
 from jeuler._jax import batch_last
 from jeuler._jax.jaxpr import Primitive
 
-difference_p = Primitive("difference")
-accumulate_p = Primitive("accumulate")
+difference_p: Any = Primitive("difference")
+accumulate_p: Any = Primitive("accumulate")
 
 
 def _difference(x, *tables, layout):
@@ -68,12 +68,14 @@ def _linear(primitive: Any, transpose: Any) -> None:
     batching.primitive_batchers[primitive] = batched
 
 
-for primitive, transpose, rule, shape in (
-    (difference_p, accumulate_p, _difference, _difference_shape),
-    (accumulate_p, difference_p, _accumulate, _accumulate_shape),
-):
+def _register(primitive: Any, transpose: Any, rule: Any, shape: Any) -> None:
+    """Teach JAX the primitive: its values, its shape, its compiled form, its derivatives and batches."""
     primitive.def_impl(jax.jit(rule, static_argnames="layout"))
     primitive.def_abstract_eval(shape)
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=False))
     _linear(primitive, transpose)
     batch_last.written_out[primitive] = rule
+
+
+_register(difference_p, accumulate_p, _difference, _difference_shape)
+_register(accumulate_p, difference_p, _accumulate, _accumulate_shape)

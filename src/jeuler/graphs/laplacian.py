@@ -27,6 +27,7 @@ Operands: arrays (..., particle), and (..., slot) a group. Leading axes are batc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 from jax import Array
@@ -37,9 +38,9 @@ from jeuler._jax import batch_last
 from jeuler._jax.jaxpr import Primitive
 from jeuler._jax.materialise import padded, stored
 
-products_p = Primitive("products")
+products_p: Any = Primitive("products")
 products_p.multiple_results = True
-laplacian_p = Primitive("laplacian")
+laplacian_p: Any = Primitive("laplacian")
 
 
 def products(x: Array, y: Array, offsets: tuple[int, ...]) -> list[Array]:
@@ -117,12 +118,16 @@ def _batched(primitive):
     return rule
 
 
-for primitive, rule in ((products_p, _products), (laplacian_p, _laplacian)):
+def _register(primitive: Any, rule: Any) -> None:
+    """Teach JAX the values, the compiled form and the batches of the primitive; its derivatives follow below."""
     primitive.def_impl(jax.jit(rule, static_argnames="offsets"))
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=primitive.multiple_results))
     batching.primitive_batchers[primitive] = _batched(primitive)
     batch_last.written_out[primitive] = rule
 
+
+_register(products_p, _products)
+_register(laplacian_p, _laplacian)
 products_p.def_abstract_eval(
     lambda x, y, *, offsets: [jax.core.ShapedArray((*x.shape[:-1], x.shape[-1] + k), x.dtype) for k in offsets]
 )

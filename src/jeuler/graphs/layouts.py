@@ -69,7 +69,9 @@ class Indexed(Layout):
 
     tables: tuple[np.ndarray, ...]
 
-    def central_force(self, law, x, v, parameters):
+    def central_force(
+        self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
+    ) -> list[Array]:
         # both ends read one slot: d is stored, its cotangent too, not worked out again for either
         d = [stored(self.difference(component)) for component in x]
         s = [self.difference(component) for component in v]
@@ -103,16 +105,18 @@ class Shifts(Layout):
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         low, high = edges.min(axis=1), edges.max(axis=1)
         self.particles = particles
-        self.offsets = tuple(int(k) for k in np.unique(high - low))
+        self.offsets: tuple[int, ...] = tuple(int(k) for k in np.unique(high - low))
         groups = []
         for k in self.offsets:
             group = np.full(particles + k, -1, np.int32)
             chosen = high - low == k
             group[high[chosen]] = numbers[chosen]
             groups.append(group)
-        self.slot_edges = tuple(groups)
+        self.slot_edges: tuple[np.ndarray, ...] = tuple(groups)
 
-    def central_force(self, law, x, v, parameters):
+    def central_force(
+        self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
+    ) -> list[Array]:
         x, v = ([kept(component) for component in y] for y in (x, v))
         squares, approaches = (self.dot_differences(y, x) for y in (x, v))
         values = map(law, squares, approaches, *map(self.by_group, parameters))
@@ -124,7 +128,7 @@ class Shifts(Layout):
         by_component = (products(a, b, self.offsets) for a, b in zip(x, y, strict=True))
         return [total(group) for group in zip(*by_component, strict=True)]
 
-    def to_slots(self, x):
+    def to_slots(self, x: Array) -> list[Array] | Array:
         return jnp.broadcast_to(x, self.particles + max(self.offsets)) if x.ndim == 0 else super().to_slots(x)
 
     def by_group(self, parameter: list[Array] | Array) -> list[Array]:
@@ -187,7 +191,7 @@ class Rows(Indexed):
         far[column, row] = other
         edge = np.full(far.shape, -1, np.int32)
         edge[column, row] = numbers
-        self.slot_edges = (edge,)
+        self.slot_edges: tuple[np.ndarray, ...] = (edge,)
 
         # What each row meets.
         by = np.argsort(other, kind="stable")
@@ -202,7 +206,7 @@ class Rows(Indexed):
         own = np.concatenate([order, order[:1], order[further]])
         more = np.concatenate([further, meets_further])
         tables = (own, place, far, more, meets[:, empty + 1 :], *met_tables)
-        self.tables = tuple(np.ascontiguousarray(table, np.int32) for table in tables)
+        self.tables: tuple[np.ndarray, ...] = tuple(np.ascontiguousarray(table, np.int32) for table in tables)
 
     def _difference(self, x, *tables):
         own, _, far = tables[:3]
@@ -234,8 +238,8 @@ class Pairs(Indexed):
 
     def __init__(self, edges: np.ndarray, numbers: np.ndarray, particles: int) -> None:
         self.particles = particles
-        self.slot_edges = (np.asarray(numbers, np.int32),)
-        self.tables = (np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1]))
+        self.slot_edges: tuple[np.ndarray, ...] = (np.asarray(numbers, np.int32),)
+        self.tables: tuple[np.ndarray, ...] = (np.ascontiguousarray(edges[:, 0]), np.ascontiguousarray(edges[:, 1]))
 
     def _difference(self, x, *tables):
         i, j = tables

@@ -59,7 +59,7 @@ def name_of(part: Any) -> str:
     return getattr(part, "__name__", type(part).__name__)
 
 
-def with_required_fields(state: ParticleState, forces: Iterable, effects: Iterable) -> ParticleState:
+def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: Iterable[Any]) -> ParticleState:
     """The state with every field that the effects write; ValueError if a field is missing or in conflict."""
     effects = tuple(effects)
     shapes: dict[str, tuple[int, ...]] = {}

@@ -38,8 +38,8 @@ class Scene:
     Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 3.
     """
 
-    forces: tuple = ()
-    effects: tuple = ()
+    forces: tuple[Any, ...] = ()
+    effects: tuple[Any, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("forces", "effects"):

@@ -11,7 +11,8 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, replace, store_as_float
+from jeuler._core.annotations import OptionalParameter, Parameter, default
+from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.components import by_component, split, stack
 
 # What a particle has in a field that nothing gave a value: (shape of one particle's value, value).
@@ -63,16 +64,16 @@ class ParticleState:
 
     position: Parameter
     velocity: Parameter
-    mass: Parameter = 1.0
-    alive: Parameter = None
-    age: Parameter = None
-    lifetime: Parameter = None
-    color: Parameter = None
-    opacity: Parameter = None
-    size: Parameter = None
-    shape: Parameter = None
-    births: Parameter = None
-    missed_births: Parameter = None
+    mass: Parameter = default(1.0)
+    alive: OptionalParameter = default(None)
+    age: OptionalParameter = default(None)
+    lifetime: OptionalParameter = default(None)
+    color: OptionalParameter = default(None)
+    opacity: OptionalParameter = default(None)
+    size: OptionalParameter = default(None)
+    shape: OptionalParameter = default(None)
+    births: OptionalParameter = default(None)
+    missed_births: OptionalParameter = default(None)
     extra: dict[str, Array] | None = None
 
     def __post_init__(self) -> None:
@@ -212,13 +213,13 @@ def zero_dead_slots(state: ParticleState) -> ParticleState:
     return replace(rest, position=position, velocity=velocity, mass=state.mass)
 
 
-def split_state(state: ParticleState) -> tuple[tuple, ParticleState]:
+def split_state(state: ParticleState) -> tuple[tuple[Any, ...], ParticleState]:
     """A state as it is carried from step to step: the motion by components, and the rest."""
     motion = split(state.position), split(state.velocity)
     return motion, replace(state, position=None, velocity=None)
 
 
-def join_state(parts: tuple[tuple, ParticleState]) -> ParticleState:
+def join_state(parts: tuple[tuple[Any, ...], ParticleState]) -> ParticleState:
     """The state of these parts."""
     (position, velocity), rest = parts
     return replace(rest, position=stack(position), velocity=stack(velocity))

@@ -34,7 +34,7 @@ class Camera:
     azimuth: float | Callable[[float], float] = -60.0
 
 
-def new_axes(dim: int, background: Any, size: tuple = (6.0, 4.5)) -> Any:
+def new_axes(dim: int, background: Any, size: tuple[float, float] = (6.0, 4.5)) -> Any:
     """Axes without a frame, that keep what is round round."""
     figure = plt.figure(figsize=size, facecolor=background)
     ax: Any

@@ -20,8 +20,9 @@ from jeuler.plotting.render import Look, Picture, alive_of
 
 
 def animate(
-    solution: Any, scene: Any = None, path: Any = None, *, fps: int = 25, every: int = 1, size: tuple = (6.0, 4.5),
-    dpi: int = 80, camera: Camera | None = None, look: Look | None = None, title: str | None = None,
+    solution: Any, scene: Any = None, path: Any = None, *, fps: int = 25, every: int = 1,
+    size: tuple[float, float] = (6.0, 4.5), dpi: int = 80,
+    camera: Camera | None = None, look: Look | None = None, title: str | None = None,
     progress: bool = True,
 ) -> Film:  # fmt: skip
     """A film of a solution: to GIF, MP4 or HTML by the end of the path, or an HTML player in a notebook.
@@ -67,7 +68,7 @@ class Film:
     scene: Any
     fps: int
     every: int
-    size: tuple
+    size: tuple[float, float]
     dpi: int
     camera: Camera
     look: Look

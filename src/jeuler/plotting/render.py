@@ -91,8 +91,8 @@ def draw(
     return ax
 
 
-def save_picture(path: Any, frame: ParticleState, scene: Any = None, *, size: tuple = (6.0, 4.5), dpi: int = 80,
-                 look: Look | None = None, **options: Any) -> None:  # fmt: skip
+def save_picture(path: Any, frame: ParticleState, scene: Any = None, *, size: tuple[float, float] = (6.0, 4.5),
+                 dpi: int = 80, look: Look | None = None, **options: Any) -> None:  # fmt: skip
     """Draw one moment to a file; ``options`` are those of `draw`."""
     look = look or Look()
     ax = new_axes(np.shape(frame.position)[-1], look.background, size)
@@ -117,6 +117,16 @@ def colors_of(state: ParticleState) -> np.ndarray:
 
 class Picture:
     """The artists of one scene, made once and moved from frame to frame."""
+
+    ax: Any
+    view: View
+    look: Look
+    dim: int
+    colliders: list[Any]
+    springs: list[Any]
+    lines: list[Any]
+    faces: Any
+    moving: bool
 
     def __init__(self, ax: Any, scene: Any, view: View, look: Look, frame: ParticleState, t: float) -> None:
         self.ax, self.view, self.look = ax, view, look

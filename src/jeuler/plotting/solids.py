@@ -15,7 +15,7 @@ from jeuler.contact.colliders import Box, Plane, Sphere
 FILL, EDGE = "#d9d4c7", "#8a8578"
 
 
-def draw_colliders(ax: Any, colliders: list, t: float, view: Any) -> list[Any]:
+def draw_colliders(ax: Any, colliders: list[Any], t: float, view: Any) -> list[Any]:
     """Draw signed distances ``collider(t, point) -> ()`` within the view; returns the artists.
 
     In space the ground comes first, then balls and boxes from the far ones to the near ones.
@@ -71,7 +71,7 @@ def _distances(collider: Any, t: Any, points: Any) -> Any:
     return jax.vmap(collider, (None, 0))(t, points)
 
 
-def in_sight(colliders: list, t: float, position: np.ndarray, toward: np.ndarray, far: float) -> np.ndarray:
+def in_sight(colliders: list[Any], t: float, position: np.ndarray, toward: np.ndarray, far: float) -> np.ndarray:
     """Which particles no solid hides from a viewer in the direction ``toward``: (particle,), by steps along the ray."""
     steps = far * np.linspace(0.01, 1.0, 40) ** 1.5
     ray = np.nan_to_num(position)[:, None] + steps[:, None] * toward

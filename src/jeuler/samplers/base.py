@@ -16,7 +16,8 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, as_component, as_float, component, store_as_float
+from jeuler._core.annotations import Parameter
+from jeuler._core.component import as_component, as_float, component, store_as_float
 from jeuler._jax import random_rows
 
 
@@ -124,8 +125,8 @@ class Normal(Sampler):
       sect. 2 (attributes drawn at birth).
     """
 
-    mean: Array
-    deviation: Array
+    mean: Parameter
+    deviation: Parameter
 
     def __post_init__(self) -> None:
         store_as_float(self, "mean", "deviation")
@@ -156,7 +157,7 @@ class Choice(Sampler):
       sect. 2 (attributes drawn at birth).
     """
 
-    values: Array
+    values: Parameter
 
     def __post_init__(self) -> None:
         store_as_float(self, "values")

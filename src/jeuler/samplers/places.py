@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import Parameter, component, store_as_float
+from jeuler._core.annotations import Parameter, SampledParameter, default
+from jeuler._core.component import component, store_as_float
 from jeuler._core.vectors import direction
 from jeuler.samplers.base import Sampler, as_sampler, numbers_of, standard_normal
 
@@ -36,8 +35,8 @@ class FromLine(Sampler):
       sect. 2 (attributes drawn at birth).
     """
 
-    start: Array
-    end: Array
+    start: Parameter
+    end: Parameter
 
     def __post_init__(self) -> None:
         store_as_float(self, "start", "end")
@@ -70,9 +69,9 @@ class FromDisc(Sampler):
       sect. 2 (attributes drawn at birth).
     """
 
-    center: Array
-    radius: Array
-    normal: Parameter = (0.0, 0.0, 1.0)
+    center: Parameter
+    radius: Parameter
+    normal: Parameter = default((0.0, 0.0, 1.0))
 
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius", "normal")
@@ -109,8 +108,8 @@ class FromSphere(Sampler):
     Source: M. E. Muller, A note on a method for generating points uniformly on n-dimensional spheres, 1959.
     """
 
-    center: Array
-    radius: Array
+    center: Parameter
+    radius: Parameter
     surface: bool = False
 
     def __post_init__(self) -> None:
@@ -146,7 +145,7 @@ class FromSurface(Sampler):
     Source: R. Osada et al., Shape distributions, ACM Transactions on Graphics 21, 2002, sect. 4.2.
     """
 
-    vertices: Array
+    vertices: Parameter
     faces: tuple[tuple[int, int, int], ...]
 
     def __post_init__(self) -> None:
@@ -193,9 +192,9 @@ class Cone(Sampler):
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.2.
     """
 
-    direction: Array
-    speed: Any
-    angle: Parameter = 0.0
+    direction: Parameter
+    speed: SampledParameter
+    angle: Parameter = default(0.0)
 
     def __post_init__(self) -> None:
         store_as_float(self, "direction", "angle")

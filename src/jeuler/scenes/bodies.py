@@ -1,12 +1,12 @@
 """Scenes of bodies: hair, cloth, jelly. All particles live from beginning to end."""
 
-# mypy: disable-error-code="arg-type"
-# Components take numbers, lists and NumPy arrays, and keep JAX arrays: their annotations say what they keep.
-
 from __future__ import annotations
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
 from jeuler.effects import PrescribedMotion
@@ -29,7 +29,7 @@ from jeuler.scenes.shapes import cube, curls, square_cloth
 DOWN = Gravity([0.0, 0.0, -9.81])
 
 
-def nod(t):
+def nod(t: Any) -> Array:
     """The way of a head that is shaken, m."""
     return jnp.stack([0.12 * jnp.sin(5.0 * t), 0.0 * t, 0.02 * jnp.sin(10.0 * t)])
 

@@ -1,8 +1,5 @@
 """Scenes of particles that are born and die: water, smoke, rain."""
 
-# mypy: disable-error-code="arg-type"
-# Components take numbers, lists and NumPy arrays, and keep JAX arrays: their annotations say what they keep.
-
 from __future__ import annotations
 
 import jax.numpy as jnp

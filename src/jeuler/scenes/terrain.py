@@ -1,13 +1,13 @@
 """A crowd: thousands of agents that run for a goal over hills, around rocks, without stepping on each other."""
 
-# mypy: disable-error-code="arg-type"
-# Components take numbers, lists and NumPy arrays, and keep JAX arrays: their annotations say what they keep.
-
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jeuler.contact import Sphere
 from jeuler.effects import SpeedLimit
@@ -20,24 +20,24 @@ SLOW, FAST = np.array([0.1, 0.2, 0.55]), np.array([0.9, 0.3, 0.1])  # colours
 ROCKS = ((5.0, 6.0), (14.0, -9.0), (26.0, 2.0))
 
 
-def height(x, y):
+def height(x: Any, y: Any) -> Array:
     """The land, m."""
     return 2.0 * jnp.sin(x / 9) * jnp.cos(y / 11) + 1.2 * jnp.sin(x / 17 + y / 13)
 
 
-def land(t, point):
+def land(t: Any, point: Array) -> Array:
     """The signed distance to the land, nearly: its slopes are gentle."""
     return point[2] - height(point[0], point[1])
 
 
-def run_to_goal(t, position, velocity, mass):
+def run_to_goal(t: Any, position: Array, velocity: Array, mass: Array) -> Array:
     """Each agent steers for 6 m/s towards the goal, within half a second."""
     way = GOAL - position[:, :2]
     wanted = 6.0 * way / jnp.linalg.norm(way, axis=1, keepdims=True)
     return jnp.pad((wanted - velocity[:, :2]) / 0.5, ((0, 0), (0, 1)))
 
 
-def keep_apart(t, position, velocity, mass):
+def keep_apart(t: Any, position: Array, velocity: Array, mass: Array) -> Array:
     """Away from where it is crowded: down the slope of the number of agents per cell, on a grid of 1.5 m."""
     cell, cells = 1.5, 96
     place = position[:, :2].T / cell + cells / 2
@@ -54,7 +54,7 @@ def keep_apart(t, position, velocity, mass):
 
 
 @uses(sets=("color",))
-def on_the_ground(t, dt, state, key):
+def on_the_ground(t: Any, dt: Any, state: ParticleState, key: Any) -> ParticleState:
     """Feet on the land; an agent is the redder the faster it runs."""
     p, v = state.position, state.velocity
     speed = jnp.clip(jnp.linalg.norm(v[:, :2], axis=1, keepdims=True) / 8 * 2 - 1, 0, 1)
@@ -71,10 +71,7 @@ def charge(agents: int = 5000) -> Setup:
     random = np.random.default_rng(0)
     place = np.stack([random.uniform(-50, -20, agents), random.uniform(-28, 28, agents)], axis=1)
     position = np.concatenate([place, np.asarray(height(*place.T))[:, None] + 0.3], axis=1)
-    rocks = tuple(
-        PointAttractor(lambda t, x=x, y=y: jnp.stack([x, y, height(x, y)]), -160.0, softening=2.0, power=2)
-        for x, y in ROCKS
-    )
+    rocks = tuple(PointAttractor([x, y, float(height(x, y))], -160.0, softening=2.0) for x, y in ROCKS)
     limit = random.normal(7.0, 0.8, agents).clip(4.0, 9.0)
     scene = Scene((run_to_goal, keep_apart, *rocks), (SpeedLimit(limit), on_the_ground))
     state = ParticleState(position, 0 * position, color=np.tile(SLOW, (agents, 1)), size=np.full(agents, 0.6))

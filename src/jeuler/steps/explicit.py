@@ -253,11 +253,11 @@ class CappedStep:
         return self.step.with_info  # type: ignore[attr-defined]  # implicit steps have it
 
     def __call__(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
-        return self.step(f, t, capped(y, self.max_norm), dt, args)
+        return self.step(f, t, _capped(y, self.max_norm), dt, args)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
-def capped(y: PyTree, max_norm: Any) -> PyTree:
+def _capped(y: PyTree, max_norm: Any) -> PyTree:
     """y, whose cotangent is scaled down to the norm max_norm where it is larger."""
     return y
 
@@ -274,4 +274,4 @@ def _capped_backward(max_norm: Any, _: None, cotangent: PyTree) -> tuple[PyTree]
     return (trees.scale(jnp.where(norm > max_norm, max_norm / norm, 1), cotangent),)
 
 
-capped.defvjp(_capped_forward, _capped_backward)
+_capped.defvjp(_capped_forward, _capped_backward)

@@ -191,8 +191,8 @@ class LinearlyImplicitEuler:
         return system.state(system.start - solve_linear(matvec, value, solver=self.linear_solver))
 
 
-implicit_euler_step = implicit_euler()
-linearly_implicit_euler_step = linearly_implicit_euler()
+implicit_euler_step: ImplicitEuler = implicit_euler()
+linearly_implicit_euler_step: LinearlyImplicitEuler = linearly_implicit_euler()
 
 
 class System(NamedTuple):

@@ -14,9 +14,16 @@ from jeuler.plotting.accuracy import axes_or_new, label_ends
 from jeuler.solving._scan import solve
 from jeuler.steps.explicit import Step, VectorField, euler_step, rk4_step
 
-EXACT = {"color": "0.2", "linewidth": 1.6}
+EXACT: dict[str, Any] = {"color": "0.2", "linewidth": 1.6}
 POINTS = 501  # of a curve drawn from a function
-LINE = {"headwidth": 0, "headlength": 0, "headaxislength": 0, "width": 0.002, "pivot": "mid", "color": "0.75"}
+LINE: dict[str, Any] = {
+    "headwidth": 0,
+    "headlength": 0,
+    "headaxislength": 0,
+    "width": 0.002,
+    "pivot": "mid",
+    "color": "0.75",
+}
 
 
 def slope_field(
