@@ -119,7 +119,10 @@ def test_no_more_residuals_than_parameters():
     ("call", "message"),
     [
         (lambda: jeuler.fit(lambda p: p, jnp.array([1])), "params must be floating, got int"),
-        (lambda: jeuler.fit(lambda p: p, {"k": 0.0}, positive=True), r"\['k'\] must be greater than 0"),
+        (
+            lambda: jeuler.fit(lambda p: p, {"k": -1.0}, positive=True),
+            r"\['k'\] must be not below its lower bound, got -1",
+        ),
         (lambda: jeuler.fit(lambda p: p, jnp.array([1.0, jnp.nan])), r"params\[1\] must be finite, got nan"),
         (lambda: jeuler.fit(lambda p: p, {"k": 1.0}, positive={"c": True}), "positive must be one value or a tree"),
         (lambda: jeuler.fit(lambda p: jnp.log(-p), jnp.array([1.0])), "residual is not finite at the start"),

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.component import result
-from jeuler._core.interpolate import hermite
-from jeuler.fitting._fit import fit
 from jeuler.fitting._tables import fit_table
-from jeuler.fitting.observations import amplitude_of, checked_observations, horizons, place_in_steps, speed_of
-from jeuler.fitting.parameters import is_positive, put_parameters, read_parameters, values_in_forces
-from jeuler.particles._simulate import simulate
+from jeuler.fitting.engine import Options
+from jeuler.fitting.parameters import values_of_springs
+from jeuler.fitting.recorded import Recorded
+from jeuler.fitting.result import Fit, as_pytree
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, rk4_step
@@ -30,16 +26,22 @@ class SpringFit:
     """What `fit_springs` found.
 
     Attributes:
-      ks, kd: stiffness (N/m) and damping (N s/m) of the fitted scene's `Springs`, fitted or not; a tuple of them where
-        the scene has several.
+      ks, kd: stiffness (N/m) and damping (N s/m) of the fitted scene's `Springs`, fitted or not; where the scene has
+        several, one array with one value a spring.
       scene, state: the scene and the initial state with the fitted parameters put in.
       params: the fitted parameters by name.
-      loss: mean square of position residuals, m^2.
-      history: the loss after each iteration, m^2.
-      stderr: standard errors by name, of the structure of params; inf where the data do not determine one.
+      loss: mean square of position residuals, m^2; over sigma^2 where sigma is given.
+      history: the loss after each iteration.
+      stderr: standard errors by name, of the structure of params, for noise that is correlated as the residual is; inf
+        where the data do not determine one. ``stderr_white``: the same for independent noise.
       covariance: of the parameters in the order of ``jax.flatten_util.ravel_pytree(params)``.
       predicted: positions at the given times, (time, particle, dim), m.
-      converged, message, undetermined, nonfinite: as in `Fit`.
+      step_bias: how far the integrator's own error moves each parameter, of the structure of params: fitted minus what
+        an exact integrator would give. None where it was not asked for.
+      start: where the search began: "data" (from the positions alone) or "given" (the scene's values).
+      explained: share of the variance of the positions that the fit explains.
+      noise_ratio: residual over the noise seen in the data, or over sigma; 1 where nothing is left to explain.
+      converged, message, undetermined, blind, at_bound, autocorrelation, residual, nonfinite, starts: as in `Fit`.
     Example:
       >>> import jax.numpy as jnp, numpy as np, jeuler
       >>> weight = jeuler.ParticleState([[0.0], [1.2]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
@@ -57,17 +59,31 @@ class SpringFit:
     scene: Scene
     state: ParticleState
     params: dict[str, Any]
-    loss: float
-    history: np.ndarray
+    loss: Any
+    history: Any
     stderr: Any
-    covariance: np.ndarray | None
+    covariance: Any
     predicted: Array
-    converged: bool
+    converged: Any
     message: str
     undetermined: tuple[str, ...]
-    nonfinite: int
+    nonfinite: Any
+    stderr_white: Any = None
+    residual: Any = None
+    blind: tuple[str, ...] = ()
+    at_bound: tuple[str, ...] = ()
+    explained: Any = None
+    noise_ratio: Any = None
+    autocorrelation: Any = None
+    starts: Any = None
+    step_bias: Any = None
+    start: str = "given"
 
     _repr_html_ = fit_table
+    correlation = Fit.correlation
+
+
+as_pytree(SpringFit, ("message", "undetermined", "blind", "at_bound", "start"))
 
 
 def fit_springs(
@@ -78,13 +94,23 @@ def fit_springs(
     *,
     dt: float,
     parameters: tuple[str, ...] = ("ks", "kd"),
+    where: Callable[[Scene], Any] | None = None,
+    bounds: dict[str, Any] | None = None,
+    sigma: Any = None,
+    weights: Any = None,
+    loss: str = "linear",
+    loss_scale: float | None = None,
+    start: str = "data",
+    starts: Any = None,
     t0: float = 0.0,
     num_steps: int | None = None,
     step: Step = rk4_step,
     optimizer: Any = None,
     max_iterations: int = 200,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-4,
     grow: bool = True,
+    step_bias: bool = True,
+    resume: Any = None,
     progress: bool | None = None,
 ) -> SpringFit:
     """Fit a scene's parameters to measured positions by gradient through the simulation.
@@ -100,19 +126,31 @@ def fit_springs(
       times: when the positions were measured, (time,), s; not decreasing, on any grid, from t0 on.
       positions: what was measured, (time, particle, dim), m; NaN = not observed.
       dt: step size of the simulation, s.
-      parameters: what is free: any of "ks", "kd", "rest_length" (or another parameter of the scene's forces, such as
-        "coefficient" of a drag; "forces[1].ks" names that of one force among several), "mass" (of the particles that
+      parameters: what is free: any of "ks", "kd", "rest_length" (of the scene's springs, or another parameter of its
+        forces, such as "coefficient" of a drag; "forces[1].ks" names that of one force), "mass" (of the particles that
         can move), "velocity", "position" (their initial ones) and "anchors" (positions of the pinned particles).
-        Force parameters and masses are fitted as logarithms, so they stay positive; vectors, such as gravity's
-        "acceleration", are fitted as they are.
+        What cannot be negative by its meaning is fitted from 0 on, 0 included.
+      where: a function of the scene that picks further arrays to fit, such as ``lambda scene: scene.forces[1].ks``;
+        they are ``params["where"]``.
+      bounds: ``{name: (lower, upper)}`` for any of the parameters; None or inf leaves a side open.
+      sigma: the known error of the positions, m, broadcast to (time, particle, dim); errors are then not scaled by the
+        residual.
+      weights: relative weights instead, broadcast to (time, particle, dim).
+      loss, loss_scale: "linear", or "soft_l1" or "huber" for outliers, as in `fit`.
+      start: "data" finds ks, kd and what else enters the forces linearly from the positions alone, by the weak form of
+        the equation of motion, and starts there; "given" starts from the scene's values. Where the first does not lead
+        to a good fit, the second is tried too, and the better is kept.
+      starts: search from this many starts about that one, in one batched program, as in `fit`.
       t0: time of the state, s.
       num_steps: number of steps; None takes as many as reach the last time.
       step: the method, as in `solve`.
       optimizer: None for Levenberg-Marquardt, or any optax optimiser, as in `fit`.
       max_iterations: the most iterations in each stage.
       tolerance: stop when the loss decreases by less than this share.
-      grow: fit the first sixteenth of the time span first, then twice as much and so on: what keeps an oscillation's
-        fit out of wrong periods. False fits all of it at once.
+      grow: from given values, fit the first sixteenth of the time span first, then twice as much and so on: what keeps
+        an oscillation's fit out of wrong periods. False fits all of it at once.
+      step_bias: solve once more at dt / 2 and report how far the integrator's error moves each parameter.
+      resume: path of a file in which the search writes where it is, and from which it goes on, as in `fit`.
       progress: show a progress bar; None shows it on a terminal.
     Returns: `SpringFit`.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
@@ -131,61 +169,31 @@ def fit_springs(
     Source: the source's springs and dampers; K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least
       Squares Problems, 2004.
     """
-    state.check()
-    scene.check(state)
-    checks.positive("dt", dt, "s")
-    checks.number("t0", t0)
-    times, targets = checked_observations(times, positions, state.position.shape, float(t0))
-    needed = max(1, int(np.ceil((times[-1] - t0) / dt * (1 - 1e-12))))
-    num_steps = needed if num_steps is None else checks.count("num_steps", num_steps, least=1)
-    if num_steps < needed:
-        raise ValueError(
-            f"times must lie in the simulated span, {t0} to {t0 + num_steps * dt} s, got {times[-1]}; "
-            f"num_steps={needed} reaches it"
-        )
-    observed = np.nonzero(np.isfinite(targets))
-    observed_targets = targets[observed]
-    interval, s = place_in_steps(times, t0, dt, num_steps)
-    start = read_parameters(scene, state, parameters)
-    amplitude = amplitude_of(targets)
-
-    def predict(params: dict[str, Any]) -> Array:
-        fitted_scene, fitted_state = put_parameters(scene, state, params)
-        run = simulate(
-            fitted_scene,
-            fitted_state,
-            dt=dt,
-            num_steps=num_steps,
-            t0=t0,
-            step=step,
-            save=lambda t, now: (now.position, now.velocity),
-        )
-        p, v = run.y
-        fraction = jnp.asarray(s, p.dtype)[:, None, None]
-        return hermite(fraction, jnp.asarray(dt, p.dtype), p[interval], p[interval + 1], v[interval], v[interval + 1])
-
-    def residual(params: dict[str, Any]) -> Array:
-        predicted = predict(params)
-        return predicted[observed] - jnp.asarray(observed_targets, predicted.dtype)
-
-    stages = horizons(times[observed[0]] - t0) if grow else ()
-    result = fit(
-        residual,
-        start,
-        positive={name: is_positive(name) for name in start},
-        scale={name: speed_of(times, targets) if name == "velocity" else amplitude for name in start},
+    options = Options(
+        loss=loss,
+        loss_scale=loss_scale,
+        starts=starts,
         optimizer=optimizer,
-        max_iterations=max_iterations,
+        max_iterations=checks.count("max_iterations", max_iterations, least=1),
         tolerance=tolerance,
-        stages=stages,
+        resume=resume,
         progress=progress,
     )
-    fitted_scene, fitted_state = put_parameters(scene, state, result.params)
+    options.check()
+    if start not in ("data", "given"):
+        raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
+    task = Recorded.of(
+        scene, state, times, positions, dt=dt, t0=t0, num_steps=num_steps, step=step, names=parameters, where=where
+    )
+    found, begun = task.fit(options, bounds, sigma, weights, start, grow)
+    fields, bias, fitted_scene, fitted_state, predicted = task.completed(found, step_bias)
     return SpringFit(
-        ks=values_in_forces(fitted_scene, "ks"),
-        kd=values_in_forces(fitted_scene, "kd"),
+        ks=values_of_springs(fitted_scene, "ks"),
+        kd=values_of_springs(fitted_scene, "kd"),
         scene=fitted_scene,
         state=fitted_state,
-        predicted=jax.jit(predict)(result.params),
-        **{field.name: getattr(result, field.name) for field in dataclasses.fields(result)},
+        predicted=predicted,
+        step_bias=bias,
+        start=begun,
+        **fields,
     )

@@ -1,198 +1,221 @@
-"""The two descents behind ``fit``: Levenberg-Marquardt, and any optax optimiser. Both keep the best point seen."""
+"""The searches behind ``fit``, with values in hand: watched, interrupted and taken up again."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-# a Jacobian larger than this is not formed: fits with more unknowns go through optax.lbfgs
-JACOBIAN_BYTES = 2**30
-JACOBIAN_COLUMNS_AT_ONCE = 16
+from jeuler.fitting import least_squares
+from jeuler.fitting.kept import Record
+from jeuler.fitting.least_squares import Evaluate, State, Task, again, start
+from jeuler.fitting.losses import LOSSES, Loss
+
+ROUGH = 0.1  # standard errors: near enough for what is only a stage
+TUNING = 1.345  # of a robust loss: 95 % as good as least squares where the noise is normal
 
 
 @dataclasses.dataclass
-class Progress:
-    """What a fit has seen so far."""
+class Watch:
+    """What looks at a search between its iterations: a bar, and a file that it could go on from."""
 
     bar: Any
-    best: Any
-    best_loss: float
-    history: list[float] = dataclasses.field(default_factory=list)
-    nonfinite: int = 0
+    record: Record | None = None
+    interrupted: bool = False
 
-    def see(self, z: Any, loss: float) -> None:
-        """One iteration's end: its point and its loss over all the data."""
-        self.history.append(loss if np.isfinite(loss) else np.inf)
-        self.offer(z, loss)
-        self.bar.update()
-        self.bar.set_postfix_str(f"loss {loss:.4g}, best {self.best_loss:.4g}", refresh=False)
-
-    def offer(self, z: Any, loss: float) -> None:
-        if np.isfinite(loss) and not loss >= self.best_loss:
-            self.best, self.best_loss = z, loss
+    def see(self, stage: int, state: State, history: list[float], counted: bool) -> None:
+        if counted:
+            self.bar.update()
+            self.bar.set_postfix_str(f"loss {history[-1]:.4g}" if history else "", refresh=False)
+        if self.record is not None:
+            self.record.save(stage, state, history)
 
 
-class LeastSquares:
-    """A residual vector r(z), compiled once: its weighted mean square, gradient and Jacobian.
+@dataclasses.dataclass
+class Found:
+    """Where a search ended, and the losses on its way."""
 
-    loss(z) = sum_k w_k r_k(z)^2 / count,   w_k = 1 for what counts, 0 for what does not count yet
-    """
-
-    evaluate: Callable[..., Any]
-    value_and_grad: Callable[..., Any]
-    objective: Callable[..., Any]
-    linearise: Callable[..., Any]
-
-    def __init__(self, residual: Callable[[Array], Array], size: int) -> None:
-        self.size = size
-        self.evaluate = jax.jit(lambda z, w: self._losses(residual(z), w))
-        self.value_and_grad = jax.jit(jax.value_and_grad(lambda z, w: self._losses(residual(z), w), has_aux=True))
-        self.objective = lambda z, w: self._losses(residual(z), w)[0]
-
-        def linearise(z: Array, w: Array) -> tuple[Array, Array, Array, Array]:
-            def column(direction):
-                return jax.jvp(residual, (z,), (direction,))
-
-            directions = jnp.eye(len(z), dtype=z.dtype)
-            values, columns = jax.lax.map(column, directions, batch_size=JACOBIAN_COLUMNS_AT_ONCE)
-            r, jacobian = values[0], columns.T
-            return r, jacobian, *self._normal_equations(r, jacobian, w)
-
-        self.linearise = jax.jit(linearise)  # r, J, J^T J and J^T r of what counts
-
-    def _losses(self, r: Array, w: Array) -> tuple[Array, Array]:
-        """The mean square of what counts now, and of everything."""
-        r = r / jnp.asarray(self.size, r.dtype) ** 0.5
-        counted = jnp.sum(jnp.where(w > 0, r, 0) ** 2)
-        return counted / jnp.maximum(jnp.mean(w), 1 / self.size), jnp.sum(r**2)
-
-    def _normal_equations(self, r: Array, jacobian: Array, w: Array) -> tuple[Array, Array]:
-        """J^T J and J^T r of the weighted loss."""
-        used = (w > 0)[:, None]
-        jacobian, r = jnp.where(used, jacobian, 0), jnp.where(w > 0, r, 0)
-        count = jnp.maximum(jnp.sum(w), 1)
-        return jacobian.T @ jacobian / count, jacobian.T @ r / count
+    state: State
+    history: list[float]
+    spread: float = 1.0
 
 
-def levenberg_marquardt(
-    problem: LeastSquares,
-    z: Any,
-    weight: Array,
-    progress: Progress,
+def search(
+    evaluate: Evaluate,
+    loss: Loss,
+    x: np.ndarray,
+    task: Task,
+    stages: Sequence[np.ndarray],
     *,
     max_iterations: int,
-    tolerance: float,
-    longest_step: float = 1.0,
-) -> tuple[Any, bool]:
-    """Descend by damped Gauss-Newton steps (J^T J + damping I) s = -J^T r, the damping ruled by the gain ratio.
+    watch: Watch,
+    spread: float | None = None,
+    noise: float | None = None,
+) -> Found:
+    """Levenberg-Marquardt through the stages, then over everything, then with a robust loss if there is one.
 
-    The damping is one number for all unknowns, in the units of `Unknowns`: what the data do not determine stays at
-    its start. No step is longer than ``longest_step`` in any unknown, a factor e for a logarithm.
-
-    Returns the last accepted point, and whether it converged: the relative decrease fell below the tolerance.
-    Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems, 2004, sect. 3.2.
+    ``spread`` None: the size beyond which a residual counts as an outlier is taken from the residuals themselves. A
+    stage ends where its residual is that of the ``noise``: a few data would lead anywhere beyond that.
     """
-    z = np.asarray(z)
-    loss, total = (float(x) for x in problem.evaluate(z, weight))
-    progress.offer(z, total)
-    if not np.isfinite(loss):
-        progress.nonfinite += 1
-        return z, False
-    matrix, gradient = _normal_equations(problem, z, weight)
-    damping = 1e-3 * float(np.max(np.diag(matrix)))
-    growth = 2.0
-    for _ in range(max_iterations):
-        if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
-            progress.nonfinite += 1
-            return z, False
-        if loss == 0.0 or not np.any(gradient):
-            return z, True
-        step = _damped_step(matrix, gradient, damping)
-        length = float(np.max(np.abs(step)))
-        if length > longest_step:
-            step = step * (longest_step / length)
-        trial = (z + step).astype(z.dtype)
-        predicted = -float(step @ (2 * gradient + matrix @ step))
-        trial_loss, trial_total = (float(x) for x in problem.evaluate(trial, weight))
-        progress.nonfinite += not np.isfinite(trial_loss)
-        if trial_loss < loss:
-            gain = (loss - trial_loss) / max(predicted, 1e-300)
-            damping, growth = damping * max(1 / 5, 1 - (2 * gain - 1) ** 3), 2.0
-            converged = loss - trial_loss <= tolerance * loss and gain > 0.25
-            z, loss = trial, trial_loss
-            progress.see(z, trial_total)
-            if converged:
-                return z, True
-            matrix, gradient = _normal_equations(problem, z, weight)
-        else:
-            damping, growth = damping * growth, growth * 2
-            if predicted <= tolerance * loss or length <= 4 * float(np.finfo(z.dtype).eps):
-                return z, True
-    return z, False
+    squares = LOSSES["linear"]
+    robust: list[tuple[Loss, Any, float]] = []
+    if loss.name != "linear":
+        robust = [(loss, task.all_weights, task.tolerance)] * (1 if spread is not None else 3)
+    plan: list[tuple[Loss, Any, float]] = [(squares, weights, ROUGH) for weights in stages]
+    plan += [(squares, task.all_weights, task.tolerance if not robust else ROUGH), *robust]
+    state, first = start(x, len(task.weights), max_iterations), 0
+    history: list[float] = []
+    if watch.record is not None and (kept := watch.record.load()) is not None:
+        first, state, history = kept
+    bend = 1.0
+    for number, (own_loss, weights, tolerance) in enumerate(plan):
+        if own_loss.name != "linear":
+            bend = _spread_of(state.residual, task.all_weights) if spread is None else spread
+        if number < first:
+            continue
+        enough = 1.5 * (noise or 0.0) ** 2 * np.sum(weights > 0) if number < len(stages) else 0.0
+        now = task._replace(weights=weights, tolerance=np.asarray(tolerance), spread=np.asarray(bend))
+        now = now._replace(enough=np.asarray(enough))
+        state = state if number == first else again(state)
+        state = _through(evaluate, own_loss, state, now, number, history, watch)
+        if watch.interrupted or state.status == least_squares.NOT_FINITE:
+            break
+    return Found(state, history, bend)
 
 
-def _normal_equations(problem: LeastSquares, z: np.ndarray, weight: Array) -> tuple[np.ndarray, np.ndarray]:
-    """J^T J and J^T r in float64."""
-    _, _, matrix, gradient = problem.linearise(z, weight)
-    return np.asarray(matrix, float), np.asarray(gradient, float)
+def _through(
+    evaluate: Evaluate, loss: Loss, state: State, task: Task, stage: int, history: list[float], watch: Watch
+) -> State:
+    """One search to its end."""
+    with np.errstate(all="ignore"):
+        while state.status == least_squares.RUNNING and state.iterations < len(state.history):
+            before = state.iterations
+            try:
+                state = least_squares.advance(evaluate, loss, state, task, state.evaluations + 1)
+                counted = bool(state.iterations > before)
+                history += [float(state.total)] * counted
+                watch.see(stage, state, history, counted)
+            except KeyboardInterrupt:
+                if np.isinf(state.cost):
+                    raise
+                watch.interrupted = True
+                break
+    return state
 
 
-def _damped_step(matrix: np.ndarray, gradient: np.ndarray, damping: float) -> np.ndarray:
-    """The solution of (J^T J + damping I) s = -J^T r, by the eigenvectors of the symmetric matrix."""
-    values, vectors = np.linalg.eigh(matrix)
-    values = np.maximum(values, 0) + max(damping, 1e-15 * values[-1])
-    return -vectors @ ((vectors.T @ gradient) / values)
+def _spread_of(residual: np.ndarray, weights: np.ndarray) -> float:
+    """How large a residual may be that is no outlier, from the median of their sizes."""
+    kept = np.abs(residual[weights > 0])
+    middle = float(np.median(kept)) / 0.6745
+    return TUNING * (middle if middle > 0 else float(np.sqrt(np.mean(kept**2))) or 1.0)
+
+
+def many_starts(
+    both: Callable, loss: Loss, xs: np.ndarray, task: Task, *, max_iterations: int, watch: Watch, at_once: int
+) -> list[State]:
+    """A search from each of the starts; their residuals and Jacobians are evaluated ``at_once`` by one program."""
+    batched = jax.jit(jax.vmap(both, in_axes=(0, None)))
+    states = [start(x, len(task.weights), max_iterations) for x in xs]
+
+    def goes_on(state: State) -> bool:
+        return bool(state.status == least_squares.RUNNING and state.iterations < max_iterations)
+
+    while running := [k for k, state in enumerate(states) if goes_on(state)]:
+        for first in range(0, len(running), at_once):
+            some = running[first : first + at_once]
+            filled = [*some, *some[:1] * (at_once - len(some))]
+            trials = np.stack([states[k].trial for k in filled])
+            values, jacobians = (np.asarray(a, float) for a in batched(trials, task.data))
+            for place, k in enumerate(some):
+                known = _known(values[place], jacobians[place])
+                with np.errstate(all="ignore"):
+                    states[k] = least_squares.advance(known, loss, states[k], task, states[k].evaluations + 1)
+        watch.bar.update()
+    return states
+
+
+def _known(value: np.ndarray, jacobian: np.ndarray) -> Evaluate:
+    """An evaluation whose result is there already."""
+    return Evaluate(lambda x, data: value, lambda x, data: (value, jacobian))  # type: ignore[arg-type,return-value]
 
 
 def descend(
     optimizer: Any,
-    problem: LeastSquares,
-    z: Any,
-    weight: Array,
-    progress: Progress,
+    evaluate: Evaluate,
+    x: np.ndarray,
+    task: Task,
+    stages: Sequence[np.ndarray],
+    scale: np.ndarray,
     *,
     max_iterations: int,
     tolerance: float,
+    watch: Watch,
     patience: int = 50,
-) -> tuple[Any, bool]:
-    """Descend by an optax optimiser. A step into non-finite values goes back to the best point and halves what follows.
+) -> tuple[np.ndarray, list[float], int, bool]:
+    """Descend by an optax optimiser in x / scale. A step into non-finite values goes back to the best and is halved.
 
-    Returns the last finite point, and whether it converged: no relative decrease above the tolerance in ``patience``
-    iterations.
+    Returns the best point over everything, the losses, how many points were not finite, and whether the loss stood
+    still: no relative decrease above the tolerance in ``patience`` iterations.
     """
     import optax
 
     optimizer = optax.with_extra_args_support(optimizer)
+    size = max(int(np.sum(task.all_weights > 0)), 1)
+    lower, upper, unit = (jnp.asarray(a) for a in (task.lower / scale, task.upper / scale, scale))
+
+    def losses(z, data, weights, all_weights):
+        raw = evaluate.residual(z * unit, data)
+        some, everything = (jnp.sum(jnp.where(w > 0, raw * w, 0) ** 2) for w in (weights, all_weights))
+        return some / jnp.maximum(jnp.sum(weights > 0), 1), everything / size
+
+    value_and_grad = jax.jit(jax.value_and_grad(losses, has_aux=True))
 
     @jax.jit
-    def propose(z, state, value, grad, weight, damping):
+    def propose(z, state, value, grad, damping, data, weights, all_weights):
         updates, state = optimizer.update(
-            grad, state, z, value=value, grad=grad, value_fn=lambda z: problem.objective(z, weight)
+            grad, state, z, value=value, grad=grad, value_fn=lambda z: losses(z, data, weights, all_weights)[0]
         )
-        return optax.apply_updates(z, jax.tree.map(lambda u: damping * u, updates)), state
+        z = optax.apply_updates(z, jax.tree.map(lambda u: damping * u, updates))
+        return jnp.clip(z, lower, upper), state
 
-    state, damping = optimizer.init(z), 1.0
-    best, best_loss, since_best = z, np.inf, 0
-    for _ in range(max_iterations):
-        (loss, total), gradient = problem.value_and_grad(z, weight)
-        if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-            progress.nonfinite += 1
-            if not np.isfinite(best_loss):
-                return z, False
-            z, state, damping = best, optimizer.init(best), damping / 2
-            continue
-        progress.see(z, float(total))
-        since_best = 0 if loss < (1 - tolerance) * best_loss else since_best + 1
-        if loss < best_loss:
-            best, best_loss = z, float(loss)
-        if loss == 0.0 or since_best >= patience:
-            return best, True
-        z, state = propose(z, state, loss, gradient, weight, damping)
-    progress.offer(z, float(problem.evaluate(z, weight)[1]))
-    return best, False
+    history: list[float] = []
+    nonfinite, still = 0, False
+    z = jnp.asarray(x / scale)
+    best_ever, best_total = z, np.inf
+    for number, weights in enumerate([*stages, task.all_weights]):
+        last = number == len(stages)
+        state, damping = optimizer.init(z), 1.0
+        best, best_loss, since, still = z, np.inf, 0, False
+        for _ in range(max_iterations if last else min(max_iterations, max_iterations // 4 + 10)):
+            try:
+                (loss, total), gradient = value_and_grad(z, task.data, weights, task.all_weights)
+                if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+                    nonfinite += 1
+                    if not np.isfinite(best_loss):
+                        break
+                    z, state, damping = best, optimizer.init(best), damping / 2
+                    continue
+                history.append(float(total) if np.isfinite(total) else np.inf)
+                watch.bar.update()
+                if total < best_total:
+                    best_ever, best_total = z, float(total)
+                since = 0 if loss < (1 - tolerance) * best_loss else since + 1
+                if loss < best_loss:
+                    best, best_loss = z, float(loss)
+                still = loss == 0.0 or since >= patience
+                if still:
+                    break
+                z, state = propose(z, state, loss, gradient, damping, task.data, weights, task.all_weights)
+            except KeyboardInterrupt:
+                if not history:
+                    raise
+                watch.interrupted = True
+                break
+        z = best
+        if watch.interrupted:
+            break
+    return np.asarray(best_ever, float) * scale, history, nonfinite, bool(still)

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from jeuler._core import checks
 
-def checked_observations(
-    times: Any, positions: Any, shape: tuple[int, ...], t0: float
-) -> tuple[np.ndarray, np.ndarray]:
+
+def checked_observations(times: Any, positions: Any, shape: tuple[int, ...], t0: float) -> tuple[np.ndarray, Any]:
     """Times and targets as float64 NumPy arrays, checked."""
-    times, targets = np.asarray(times, float), np.asarray(positions, float)
+    times = np.asarray(times, float)
+    targets: Any = positions if checks.is_traced(positions) else np.asarray(positions, float)
     if times.ndim != 1 or not len(times):
         raise ValueError(f"times must have shape (time,) with at least one time, got {times.shape}")
     if targets.shape != (len(times), *shape):
@@ -29,6 +30,8 @@ def checked_observations(
             f"times must lie in the simulated span, which begins at t0 = {t0} s, got {times[0]}; "
             f"pass t0, the time of the state, or drop the rows before it"
         )
+    if checks.is_traced(targets):
+        return times, targets
     if np.isinf(targets).any():
         raise ValueError("positions must be finite, or NaN where not observed, got inf")
     if not np.isfinite(targets).any():
@@ -67,3 +70,33 @@ def speed_of(times: np.ndarray, targets: np.ndarray) -> float:
     quotients = (targets[lag:] - targets[:-lag]) / span
     rms = float(np.sqrt(np.nanmean(quotients**2))) if np.isfinite(quotients).any() else 0.0
     return rms if np.isfinite(rms) and rms > 0 else 1.0
+
+
+def variance_of(columns: np.ndarray, weights: np.ndarray) -> float | None:
+    """Sum of squares of (time, column) data about the mean of each column, weighted; None where nothing moves."""
+    seen = np.isfinite(columns) & (weights > 0)
+    mean = np.sum(np.where(seen, columns, 0), axis=0) / np.maximum(seen.sum(axis=0), 1)
+    total = float(np.sum(np.where(seen, (columns - mean) * weights, 0) ** 2))
+    return total if total > 0 else None
+
+
+def noise_of(times: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> float | None:
+    """Standard deviation of the noise, from what of 7 neighbouring samples no polynomial of fifth order describes.
+
+    It is an upper bound where the motion is sampled less than some ten times a period. None where there are too few
+    samples, or two at one time.
+    """
+    width, kept, squares = 7, 0, 0.0
+    for column, weight in zip(columns.T, weights.T, strict=True):
+        seen = np.isfinite(column) & (weight > 0)
+        t, x, w = times[seen], column[seen], weight[seen]
+        if len(t) < width + 2 or (np.diff(t) <= 0).any():
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(t, width)
+        place = (windows - windows.mean(axis=1, keepdims=True)) / np.ptp(windows, axis=1)[:, None]
+        products = np.prod(place[:, :, None] - place[:, None, :] + np.eye(width), axis=2)
+        contrast = 1 / products  # the highest divided difference: orthogonal to all lower polynomials
+        contrast /= np.linalg.norm(contrast, axis=1, keepdims=True)
+        left = np.sum(contrast * np.lib.stride_tricks.sliding_window_view(x * w, width), axis=1)
+        squares, kept = squares + float(np.sum(left**2)), kept + len(left)
+    return float(np.sqrt(squares / kept)) if kept and squares > 0 else None

@@ -4,87 +4,151 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._core.component import Partitioned, replace
+from jeuler._core.component import parameters_of, replace
+from jeuler.forces.springs import Springs
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
 STATE_PARAMETERS = ("mass", "velocity", "position", "anchors")
-
-
-def _free(state: ParticleState) -> np.ndarray:
-    """Which particles can move."""
-    return np.broadcast_to(np.isfinite(np.asarray(state.mass)), state.position.shape[:1])
-
-
-def _fields(force: Any) -> set[str]:
-    """The names of a force's parameters."""
-    force = force.whole() if isinstance(force, Partitioned) else force
-    if not dataclasses.is_dataclass(force):
-        return set()
-    return {field.name for field in dataclasses.fields(force)} - {"edges", "function"}
+WHERE = "where"  # the name of what a function of the scene picks
 
 
 def _owners(scene: Scene, name: str) -> tuple[list[int], str]:
-    """Which forces have the parameter "ks", or "forces[1].ks" for one of them, and its field's name."""
+    """Which forces a name speaks of, and its field: "ks" of the springs first, "forces[1].ks" of one force."""
     one = re.fullmatch(r"forces\[(\d+)\]\.(\w+)", name)
     field = one.group(2) if one else name
-    owners = [k for k, force in enumerate(scene.forces) if field in _fields(force)]
-    return [k for k in owners if one is None or k == int(one.group(1))], field
+    owners = [k for k, force in enumerate(scene.forces) if field in parameters_of(force)]
+    if one is not None:
+        return [k for k in owners if k == int(one.group(1))], field
+    springs = [k for k in owners if isinstance(scene.forces[k], Springs)]
+    return springs or owners, field
 
 
-def values_in_forces(scene: Scene, name: str) -> Any:
-    """What the one force that has this parameter has there; a tuple where several have it."""
-    owners, field = _owners(scene, name)
-    values = tuple(getattr(scene.forces[k], field) for k in owners)
-    return values[0] if len(values) == 1 else values
+def values_of_springs(scene: Scene, field: str) -> Any:
+    """What all springs of a scene have there: as it is of one `Springs`, of several one array, one value a spring."""
+    springs = [force for force in scene.forces if isinstance(force, Springs)]
+    if len(springs) == 1:
+        return getattr(springs[0], field)
+    parts = [jnp.broadcast_to(getattr(force, field), (len(force.edges),)) for force in springs]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0)
 
 
-def is_positive(name: str) -> bool:
-    """Whether a parameter of this name is fitted as a logarithm."""
-    return name.rpartition(".")[2] not in ("velocity", "position", "anchors", "acceleration")
+@dataclasses.dataclass(frozen=True)
+class Places:
+    """Which particles are free and which pinned, and what is fitted: hashable, a part of the program."""
+
+    names: tuple[str, ...]
+    free: tuple[int, ...]
+    pinned: tuple[int, ...]
+    where: Callable[[Scene], Any] | None = None
+
+    @classmethod
+    def of(cls, state: ParticleState, names: Any, where: Callable[[Scene], Any] | None) -> Places:
+        """The places of these names, or one ValueError."""
+        if isinstance(names, str) or not (names or where is not None):
+            raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {names!r}')
+        names = tuple(names)
+        for name in names:
+            if not isinstance(name, str):
+                raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {name!r} in it')
+            if names.count(name) > 1:
+                raise ValueError(f"parameters must name each parameter once, got {name!r} {names.count(name)} times")
+        can_move = np.broadcast_to(np.isfinite(np.asarray(state.mass)), state.position.shape[:1])
+        free, pinned = (tuple(np.flatnonzero(mask).tolist()) for mask in (can_move, ~can_move))
+        return cls(names, free, pinned, where)
+
+    def rows(self, name: str) -> np.ndarray:
+        """The particles whose values a name of the state speaks of."""
+        return np.asarray(self.pinned if name == "anchors" else self.free, int)
+
+    def read(self, scene: Scene, state: ParticleState) -> dict[str, Any]:
+        """The starting values by name."""
+        start: dict[str, Any] = {}
+        for name in self.names:
+            owners, field = _owners(scene, name)
+            if owners:
+                values = tuple(jnp.asarray(getattr(scene.forces[k], field), state.position.dtype) for k in owners)
+                start[name] = values if len(values) > 1 else values[0]
+            elif name not in STATE_PARAMETERS:
+                raise ValueError(
+                    f"parameters must be among {tuple(_known(scene))} for this scene, got {name!r}; "
+                    f"forces[1].ks names that of one force, and where= a function of the scene anything else"
+                )
+            elif name == "mass" and not state.mass.ndim:
+                start[name] = state.mass
+            else:
+                rows = self.rows(name)
+                if not rows.size:
+                    kind = "pinned (mass = inf)" if name == "anchors" else "free"
+                    raise ValueError(f"parameters names {name!r}, but the state has no {kind} particle")
+                start[name] = getattr(state, "position" if name == "anchors" else name)[rows]
+        if self.where is not None:
+            start[WHERE] = self._picked(scene)
+        self._refuse_twice(scene)
+        return start
+
+    def _picked(self, scene: Scene) -> Any:
+        """What the function of the scene picks."""
+        try:
+            picked = self.where(scene)  # type: ignore[misc]
+        except (AttributeError, IndexError, TypeError) as error:
+            raise ValueError(
+                f"where must be a function of the scene, such as lambda scene: scene.forces[1].ks; it fails: {error}"
+            ) from None
+        if not jax.tree.leaves(picked):
+            raise ValueError("where must pick arrays of the scene, such as scene.forces[1].ks, got nothing")
+        return picked
+
+    def _refuse_twice(self, scene: Scene) -> None:
+        """No value may have two names: "ks" and "forces[0].ks"."""
+        seen: dict[tuple[int, str], str] = {}
+        for name in self.names:
+            owners, field = _owners(scene, name)
+            for owner in owners:
+                if (owner, field) in seen:
+                    raise ValueError(
+                        f"parameters names forces[{owner}].{field} twice, as {seen[owner, field]!r} and {name!r}; "
+                        f"leave one out"
+                    )
+                seen[owner, field] = name
+
+    def put(self, scene: Scene, state: ParticleState, params: dict[str, Any]) -> tuple[Scene, ParticleState]:
+        """Scene and state with the parameters put in."""
+        forces = list(scene.forces)
+        if self.where is not None:
+            import equinox
+
+            scene = equinox.tree_at(self.where, scene, params[WHERE])
+            forces = list(scene.forces)
+        for name in self.names:
+            value = params[name]
+            owners, field = _owners(scene, name)
+            for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
+                forces[k] = replace(forces[k], **{field: x})
+            if not owners and name == "mass" and not value.ndim:
+                state = replace(state, mass=value)
+            elif not owners:
+                field = "position" if name == "anchors" else name
+                state = replace(state, **{field: getattr(state, field).at[self.rows(name)].set(value)})
+        return replace(scene, forces=tuple(forces)), state
+
+    def positive(self, scene: Scene) -> dict[str, bool]:
+        """Which of the parameters must not be negative."""
+        found = {}
+        for name in self.names:
+            owners, field = _owners(scene, name)
+            found[name] = name == "mass" or (bool(owners) and parameters_of(scene.forces[owners[0]])[field])
+        return found | ({WHERE: False} if self.where is not None else {})
 
 
-def read_parameters(scene: Scene, state: ParticleState, parameters: tuple[str, ...]) -> dict[str, Any]:
-    """The starting values by name."""
-    if isinstance(parameters, str) or not parameters:
-        raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {parameters!r}')
-    free, dtype = _free(state), state.position.dtype
-    start: dict[str, Any] = {}
-    for name in parameters:
-        if _owners(scene, name)[0]:
-            start[name] = jax.tree.map(lambda x: jnp.asarray(x, dtype), values_in_forces(scene, name))
-        elif name not in STATE_PARAMETERS:
-            known = sorted(set().union(*(_fields(force) for force in scene.forces)))
-            raise ValueError(f"parameters must be among {(*known, *STATE_PARAMETERS)} for this scene, got {name!r}")
-        elif name == "mass" and not state.mass.ndim:
-            start[name] = state.mass
-        else:
-            rows = np.flatnonzero(~free if name == "anchors" else free)
-            if not rows.size:
-                kind = "pinned (mass = inf)" if name == "anchors" else "free"
-                raise ValueError(f"parameters names {name!r}, but the state has no {kind} particle")
-            start[name] = getattr(state, "position" if name == "anchors" else name)[rows]
-    return start
-
-
-def put_parameters(scene: Scene, state: ParticleState, params: dict[str, Any]) -> tuple[Scene, ParticleState]:
-    """Scene and state with the parameters put in."""
-    free = _free(state)
-    forces = list(scene.forces)
-    for name, value in params.items():
-        owners, field = _owners(scene, name)
-        for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
-            forces[k] = replace(forces[k], **{field: x})
-        if not owners and name == "mass" and not value.ndim:
-            state = replace(state, mass=value)
-        elif not owners:
-            field = "position" if name == "anchors" else name
-            rows = np.flatnonzero(~free if name == "anchors" else free)
-            state = replace(state, **{field: getattr(state, field).at[rows].set(value)})
-    return replace(scene, forces=tuple(forces)), state
+def _known(scene: Scene) -> list[str]:
+    """The names that a scene offers."""
+    plain = sorted(set().union(*(parameters_of(force) for force in scene.forces)))
+    return [*plain, *STATE_PARAMETERS]

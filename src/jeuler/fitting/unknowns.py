@@ -1,8 +1,9 @@
-"""Parameters as the optimiser sees them: one vector, logarithms where they must stay positive."""
+"""Parameters as the search sees them: one real vector between bounds, with a name for each of its numbers."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.flatten_util import ravel_pytree
 from jax.tree_util import keystr
 
 from jeuler._core import checks
@@ -20,97 +20,187 @@ PyTree = Any
 
 
 @dataclasses.dataclass(frozen=True)
-class Unknowns:
-    """The change of variables between parameters p and the vector z.
+class Layout:
+    """How a pytree of parameters becomes a vector and back; hashable, so that programs are kept by it.
 
-        p = p0 exp(z) where positive,   p = p0 + scale z elsewhere
-
-    A step of one in z is then a large but sensible step in every parameter, whatever its unit, and z = 0 is the start
-    exactly.
+    Leaves that are not floating numbers, such as the activation function of a network, stay as they are.
     """
 
-    origin: Array
-    names: tuple[str, ...]
-    is_log: np.ndarray
-    scale: np.ndarray
-    unravel: Callable[[Array], PyTree]
-    kept: tuple[str, ...] = ()  # integers among the parameters, which stay as they are
+    rest: Rest
+    shapes: tuple[tuple[int, ...] | None, ...]  # None for a leaf that is not fitted
+    dtypes: tuple[Any, ...]
+    kept: tuple[str, ...] = ()  # names of integers that may have been meant to be fitted
 
     @classmethod
-    def of(cls, params: PyTree, positive: PyTree, scale: PyTree = None) -> Unknowns:
-        """From starting values; ``positive`` and ``scale`` are trees of the structure of params or a prefix of it."""
-        whole, (leaves, rest, kept) = params, _fitted(params)
-        params = [checks.state("params" + keystr(path), x) for path, x in leaves]
-        names = tuple(
-            keystr(path) + ("" if not x.ndim else str(list(map(int, np.unravel_index(k, x.shape)))))
-            for (path, _), x in zip(leaves, params, strict=True)
-            for k in range(x.size)
-        )
-        p, unravel_fitted = ravel_pytree(params)
-        values: np.ndarray = np.asarray(p)
-        is_log = np.asarray(_spread("positive", positive, whole, np.bool_))
-        natural = np.where(values != 0, np.abs(values), 1.0)
-        sizes = natural if scale is None else np.asarray(_spread("scale", scale, whole, values.dtype))
-        wrong = np.flatnonzero(~np.isfinite(values) | (is_log & ~(values > 0)))
-        if wrong.size:
-            k = int(wrong[0])
-            expected = "finite" if not np.isfinite(values[k]) else "greater than 0 (it is fitted as a logarithm)"
-            raise ValueError(
-                f"the start of params{names[k]} must be {expected}, got {values[k]}; start it at a positive guess"
-            )
-        return cls(p, names, is_log, sizes.astype(values.dtype), lambda z: rest.join(unravel_fitted(z)), kept)
+    def of(cls, params: PyTree) -> Layout:
+        """The layout of these parameters, or one ValueError that says which of them cannot be fitted."""
+        leaves = jax.tree_util.tree_leaves_with_path(params)
+        some = any(is_parameter(x) for _, x in leaves)
+        fitted = []
+        for path, x in leaves:
+            yes = not some or is_parameter(x) or (hasattr(x, "dtype") and _in_plain_containers(path))
+            if yes:
+                _refuse_not_floating(path, x)
+            fitted.append(yes)
+        chosen = {id(x) for (_, x), yes in zip(leaves, fitted, strict=True) if yes}
+        _, rest = partition(params, lambda x: id(x) in chosen)
+        pairs = list(zip(leaves, fitted, strict=True))
+        shapes = tuple(jnp.shape(x) if yes else None for (_, x), yes in pairs)
+        dtypes = tuple(jax.dtypes.canonicalize_dtype(jnp.result_type(x)) if yes else None for (_, x), yes in pairs)
+        kept = tuple(keystr(path) for path, x in leaves if isinstance(x, int) and _in_plain_containers(path))
+        return cls(rest, shapes, dtypes, kept)
 
     @property
-    def start(self) -> Array:
-        """Where the search begins."""
-        return jnp.zeros_like(self.origin)
+    def structure(self) -> Any:
+        return self.rest.structure
 
-    def params(self, z: Array) -> PyTree:
-        """The parameters at z."""
-        factor = jnp.exp(jnp.where(self.is_log, z, 0))
-        return self.unravel(jnp.where(self.is_log, self.origin * factor, self.origin + self.scale * z))
+    @property
+    def dtype(self) -> Any:
+        """The precision of the vector: the widest of the leaves."""
+        found = [dtype for dtype in self.dtypes if dtype is not None]
+        return jnp.result_type(*found) if found else jnp.result_type(float)
 
-    def slope(self, z: Array) -> np.ndarray:
-        """dp/dz, elementwise."""
-        return np.where(self.is_log, self.origin * np.exp(np.where(self.is_log, np.asarray(z), 0)), self.scale)
+    @property
+    def size(self) -> int:
+        """How many numbers are fitted."""
+        return sum(math.prod(shape) for shape in self.shapes if shape is not None)
+
+    def vector(self, params: PyTree) -> Any:
+        """The parameters as one vector: of JAX where one of them is traced, of NumPy otherwise."""
+        leaves = [x for x, shape in zip(jax.tree.leaves(params), self.shapes, strict=True) if shape is not None]
+        xp: Any = jnp if any(map(checks.is_traced, leaves)) else np
+        parts = [xp.ravel(xp.asarray(x, self.dtype)) for x in leaves]
+        return xp.concatenate(parts) if parts else np.zeros(0, self.dtype)
+
+    def params(self, x: Array) -> PyTree:
+        """The parameters of a vector."""
+        leaves, start = [], 0
+        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
+            if shape is not None:
+                size = math.prod(shape)
+                leaves.append(jnp.asarray(x[start : start + size].reshape(shape), dtype))
+                start += size
+        return self.rest.join(leaves)
+
+    def spread(self, name: str, prefix: PyTree, default: float) -> Any:
+        """A value for each number, from a tree of values whose structure begins that of the params."""
+        if checks.is_traced(prefix) or not isinstance(prefix, (dict, list, tuple)) or jax.tree.leaves(prefix) == []:
+            values = [default if prefix is None else prefix] * len(self.shapes)
+        else:
+            values = self._leafwise(name, prefix, default)
+        wanted = [(v, s) for v, s in zip(values, self.shapes, strict=True) if s is not None]
+        xp: Any = jnp if any(checks.is_traced(v) for v, _ in wanted) else np
+        try:
+            parts = [xp.ravel(xp.broadcast_to(xp.asarray(v, self.dtype), shape)) for v, shape in wanted]
+        except (ValueError, TypeError):
+            raise ValueError(
+                f"{name} must be one value or a tree that params extends, of its shapes, got {prefix!r}"
+            ) from None
+        return xp.concatenate(parts) if parts else np.zeros(0, self.dtype)
+
+    def _leafwise(self, name: str, prefix: PyTree, default: float) -> list[Any]:
+        """The values of a prefix tree, one a leaf; a dict may leave names out."""
+        example = jax.tree.unflatten(self.structure, list(range(len(self.shapes))))
+        if isinstance(prefix, dict) and isinstance(example, dict) and set(prefix) <= set(example):
+            prefix = {key: prefix.get(key) for key in example}
+        try:
+            spread = jax.tree.map(
+                lambda value, part: jax.tree.map(lambda _: default if value is None else value, part),
+                prefix,
+                example,
+                is_leaf=lambda x: x is None,
+            )
+            values = jax.tree.leaves(spread)
+            if len(values) != len(self.shapes):
+                raise ValueError
+        except (ValueError, TypeError):
+            raise ValueError(
+                f"{name} must be one value or a tree that params extends, got {prefix!r} for params {self.structure}"
+            ) from None
+        return values
+
+    def names(self, of_path: Callable[[tuple], str] = keystr) -> tuple[str, ...]:
+        """One name for each number: "['ks']", "['ks'][3]"; with `readable` "ks", "ks[3]"."""
+        example = jax.tree.unflatten(self.structure, list(range(len(self.shapes))))
+        names = []
+        for (path, _), shape in zip(jax.tree_util.tree_leaves_with_path(example), self.shapes, strict=True):
+            if shape is not None:
+                whole = of_path(path)
+                names += [whole + (f"[{', '.join(map(str, k))}]" if shape else "") for k in np.ndindex(*shape)]
+        return tuple(names)
 
 
-def _fitted(params: PyTree) -> tuple[list[tuple], Rest, tuple[str, ...]]:
-    """The leaves to fit with their paths, the rest, and the names of integers in it that may have been meant to fit.
-
-    A network holds functions, names and counts beside its weights; these stay. An array of integers that is no part of
-    a class is a mistake, as are integers alone: they are among those to fit, for the check to name.
-    """
-    leaves = jax.tree_util.tree_leaves_with_path(params)
-    some = any(is_parameter(x) for _, x in leaves)
-    plain = (jax.tree_util.DictKey, jax.tree_util.SequenceKey)
-
-    def in_plain_containers(path):
-        return all(isinstance(key, plain) for key in path)
-
-    fitted = [
-        (path, x)
-        for path, x in leaves
-        if not some or is_parameter(x) or (hasattr(x, "dtype") and in_plain_containers(path))
-    ]
-    chosen = {id(x) for _, x in fitted}
-    _, rest = partition(params, lambda x: id(x) in chosen)
-    kept = [keystr(path) for path, x in leaves if isinstance(x, int) and in_plain_containers(path)]
-    return fitted, rest, tuple(kept)
+def readable(path: tuple) -> str:
+    """A leaf's place in words: keys of a dict without quotes and brackets at the outermost level."""
+    key = getattr(path[0], "key", None) if path else None
+    if isinstance(key, str):
+        return key + keystr(path[1:])
+    return "params" + keystr(path)
 
 
-def _spread(name: str, prefix: PyTree, params: PyTree, dtype: Any) -> np.ndarray:
-    """A prefix tree of params, one value for each of its numbers."""
+def _in_plain_containers(path: tuple) -> bool:
+    """Whether a leaf is in dicts, lists and tuples, where a person put it, and not part of a class."""
+    return all(isinstance(key, (jax.tree_util.DictKey, jax.tree_util.SequenceKey)) for key in path)
+
+
+def _refuse_not_floating(path: tuple, x: Any) -> None:
+    where = f"params{keystr(path)}"
     try:
-        full = jax.tree.map(lambda value, part: jax.tree.map(lambda _: value, part), prefix, params)
-    except (ValueError, TypeError):
+        dtype = jnp.result_type(x)
+    except (TypeError, ValueError):
+        raise ValueError(f"{where} must be an array, got {x!r}") from None
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        raise ValueError(f"{where} must be real, got {dtype}; fit its real and its imaginary part")
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(f"{where} must be floating, got {dtype}; convert it, for example jnp.asarray(x, dtype=float)")
+
+
+def checked_bounds(layout: Layout, x: Any, bounds: PyTree, positive: PyTree) -> tuple[Any, Any]:
+    """Lower and upper bound of each number, checked against the start."""
+    lower, upper = _sides(layout, bounds)
+    is_positive = layout.spread("positive", jax.tree.map(float, positive), 0.0) > 0
+    xp: Any = jnp if any(map(checks.is_traced, (lower, upper, x))) else np
+    lower = xp.where(is_positive, xp.maximum(lower, 0), lower)
+    if xp is jnp:
+        return lower, upper
+    for wrong, expected in (
+        (~np.isfinite(x), "finite"),
+        (np.isnan(lower) | np.isnan(upper), "between bounds that are numbers"),
+        (lower > upper, "between a lower bound and an upper bound that is not below it"),
+        (x < lower, "not below its lower bound"),
+        (x > upper, "not above its upper bound"),
+    ):
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            bound = "" if expected == "finite" else f" for bounds ({lower[k]:g}, {upper[k]:g})"
+            raise ValueError(
+                f"the start of params{layout.names()[k]} must be {expected}, got {x[k]:g}{bound}; start it at a "
+                f"guess{'' if expected == 'finite' else ' between the bounds, or change them'}"
+            )
+    return lower, upper
+
+
+def _sides(layout: Layout, bounds: PyTree) -> tuple[Any, Any]:
+    """Lower and upper bound from (lower, upper) or from {name: (lower, upper)}."""
+    if bounds is None:
+        lower = upper = None
+    elif isinstance(bounds, dict):
+        for name, pair in bounds.items():
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                raise ValueError(
+                    f"bounds[{name!r}] must be a pair (lower, upper), got {pair!r}; None or inf leaves a side open"
+                )
+        lower, upper = ({name: pair[side] for name, pair in bounds.items()} for side in (0, 1))
+        example = jax.tree.unflatten(layout.structure, list(range(len(layout.shapes))))
+        known = list(example) if isinstance(example, dict) else []
+        for name in bounds:
+            if name not in known:
+                raise ValueError(f"bounds must name parameters, {known or 'of a dict'}, got {name!r}")
+    elif isinstance(bounds, (tuple, list)) and len(bounds) == 2:
+        lower, upper = bounds
+    else:
         raise ValueError(
-            f"{name} must be one value or a tree that params extends, got {prefix!r} "
-            f"for params {jax.tree.structure(params)}"
-        ) from None
-    parts = [
-        np.broadcast_to(np.asarray(value, dtype), np.shape(x)).ravel()
-        for value, x in zip(jax.tree.leaves(full), jax.tree.leaves(params), strict=True)
-        if is_parameter(x)
-    ]
-    return np.concatenate(parts) if parts else np.zeros(0, dtype)
+            f"bounds must be a pair (lower, upper) or a dict of such pairs by parameter, got {bounds!r}; "
+            f"None or inf leaves a side open"
+        )
+    return layout.spread("bounds", lower, -np.inf), layout.spread("bounds", upper, np.inf)

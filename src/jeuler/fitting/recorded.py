@@ -1,0 +1,214 @@
+"""A recording with a scene: the fit of one to the other, from checked input to what it is worth."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler._core import checks
+from jeuler.fitting.engine import Known, Options, Outcome, Problem, run
+from jeuler.fitting.observations import (
+    amplitude_of,
+    checked_observations,
+    horizons,
+    noise_of,
+    speed_of,
+    variance_of,
+)
+from jeuler.fitting.parameters import Places
+from jeuler.fitting.prediction import Prediction, compiled_positions, recording
+from jeuler.fitting.result import Fit
+from jeuler.fitting.step_bias import bias_of_step
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState
+from jeuler.steps.explicit import Step
+
+GOOD = 1.5  # times the noise: a residual below this leaves nothing to look for elsewhere
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """A scene, a recording of it, and what is free."""
+
+    scene: Scene
+    state: ParticleState
+    times: np.ndarray
+    targets: Any
+    t0: float
+    dt: float
+    prediction: Prediction
+    start: dict[str, Any]
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        state: ParticleState,
+        times: Any,
+        positions: Any,
+        *,
+        dt: Any,
+        t0: Any,
+        num_steps: Any,
+        step: Step,
+        names: Any,
+        where: Any,
+    ) -> Recorded:
+        """Checked, or one ValueError."""
+        checks.kind("scene", scene, Scene)
+        checks.kind("state", state, ParticleState)
+        state.check()
+        scene.check(state)
+        checks.positive("dt", dt, "s")
+        checks.number("t0", t0)
+        for name, value in (("dt", dt), ("t0", t0), ("times", times), ("state.mass", state.mass)):
+            if checks.is_traced(value):
+                raise ValueError(f"{name} must be a value, got a traced one; only positions and parameters are traced")
+        times, targets = checked_observations(times, positions, state.position.shape, float(t0))
+        needed = max(1, int(np.ceil((times[-1] - t0) / dt * (1 - 1e-12))))
+        num_steps = needed if num_steps is None else checks.count("num_steps", num_steps, least=1)
+        if num_steps < needed:
+            raise ValueError(
+                f"times must lie in the simulated span, {t0} to {t0 + num_steps * dt} s, got {times[-1]}; "
+                f"num_steps={needed} reaches it"
+            )
+        places = Places.of(state, names, where)
+        flat = targets.reshape(len(times), -1)
+        observed = np.arange(flat.shape[1]) if checks.is_traced(targets) else np.isfinite(flat).any(axis=0).nonzero()[0]
+        prediction = Prediction(places, step, num_steps, tuple(observed.tolist()))
+        return cls(scene, state, times, targets, float(t0), float(dt), prediction, places.read(scene, state))
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """The recording as the compiled programs take it."""
+        return recording(
+            self.scene,
+            self.state,
+            self.times,
+            self.targets,
+            self.prediction.columns,
+            dt=self.dt,
+            t0=self.t0,
+            num_steps=self.prediction.num_steps,
+        )
+
+    @property
+    def traced(self) -> bool:
+        parts = (self.scene, self.state, self.targets, self.start)
+        return any(map(checks.is_traced, jax.tree.leaves(parts)))
+
+    def problem(self, start: dict[str, Any], bounds: Any, sigma: Any, weights: Any, stages: Any) -> Problem:
+        """The least-squares problem from this start."""
+        data = self.data
+        columns = np.asarray(self.prediction.columns, int)
+
+        def in_columns(name: str, x: Any) -> Any:
+            try:
+                x = jnp.broadcast_to(x, self.targets.shape) if checks.is_traced(x) else np.asarray(x, float)
+                spread: Any = np.broadcast_to(x, self.targets.shape) if isinstance(x, np.ndarray) else x
+            except (ValueError, TypeError):
+                raise ValueError(
+                    f"{name} must broadcast to positions, (time, particle, dim) = {self.targets.shape}, "
+                    f"got shape {np.shape(x)}"
+                ) from None
+            return spread.reshape(len(self.times), -1)[:, columns]
+
+        sigma, weights = (
+            None if x is None else in_columns(name, x) for name, x in (("sigma", sigma), ("weights", weights))
+        )
+        observed = data["observed"]
+        xp: Any = np if isinstance(observed, np.ndarray) else jnp
+        if sigma is not None:
+            sigma = xp.where(observed, sigma, np.inf)
+        else:
+            weights = xp.where(observed, 1.0 if weights is None else weights, 0.0)
+        return Problem.of(
+            self.prediction,
+            start,
+            data=data,
+            bounds=bounds,
+            positive=self.prediction.places.positive(self.scene),
+            sigma=sigma,
+            weights=weights,
+            stages=stages,
+        )
+
+    def fit(
+        self, options: Options, bounds: Any, sigma: Any, weights: Any, start: str, grow: bool
+    ) -> tuple[Outcome, str]:
+        """Search from the data and, where that is not good, from the scene's values; the better, and its start."""
+        stages = self._stages() if grow else ()
+        given = self.problem(self.start, bounds, sigma, weights, stages)
+        if self.traced:
+            return run(given, options), "given"
+        known, scale = self._known(given), self._scale()
+        begun = None
+        if start == "data":
+            begun = self._from_data(given)
+        if begun is None:
+            return run(given, options, scale=scale, known=known), "given"
+        best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
+        if _good(best.fit) or options.optimizer is not None:
+            return best, "data"
+        other = run(given, dataclasses.replace(options, resume=None), scale=scale, known=known)
+        return (other, "given") if other.fit.loss < best.fit.loss * (1 - 1e-6) else (best, "data")
+
+    def _from_data(self, given: Problem) -> Problem | None:
+        """The same problem from what the weak form finds in the positions."""
+        return None
+
+    def _stages(self) -> tuple[np.ndarray, ...]:
+        """Masks of the residual for a growing horizon."""
+        observed = np.asarray(self.data["observed"]) if not checks.is_traced(self.targets) else None
+        times = self.times - self.t0
+        columns = len(self.prediction.columns)
+        if observed is None:
+            observed = np.ones((len(times), columns), bool)
+        per_value = np.repeat(times, columns)[observed.ravel()]
+        masks = horizons(per_value)
+        ends = [per_value[mask > 0].max() for mask in masks]
+        return tuple(np.repeat((times <= end).astype(float), columns) for end in ends)
+
+    def _known(self, problem: Problem) -> Known:
+        """Variance and noise of the data, weighted as the residuals are."""
+        flat = self.targets.reshape(len(self.times), -1)[:, np.asarray(self.prediction.columns, int)]
+        weight = np.asarray(problem.weights, float).reshape(flat.shape)
+        return Known(variance_of(flat, weight), noise_of(self.times, flat, weight))
+
+    def _scale(self) -> dict[str, Any]:
+        """A sensible step of each parameter, for an optax optimiser."""
+        amplitude, speed = amplitude_of(self.targets), speed_of(self.times, self.targets)
+        sizes = {"velocity": speed, "position": amplitude, "anchors": amplitude}
+
+        def size(x: Any) -> Any:
+            return np.where(np.asarray(x) != 0, np.abs(np.asarray(x, float)), 1.0)
+
+        return {name: sizes[name] if name in sizes else jax.tree.map(size, x) for name, x in self.start.items()}
+
+    def completed(self, outcome: Outcome, step_bias: bool) -> tuple[dict[str, Any], Any, Scene, ParticleState, Array]:
+        """What a `SpringFit` has beside the `Fit`: the bias of the step, scene, state and prediction."""
+        found = outcome.fit
+        fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
+        scene, state = self.prediction.places.put(self.scene, self.state, found.params)
+        data, bias = self.data, None
+        if self.traced:
+            return fields, None, scene, state, self.prediction.positions(found.params, data)
+        predicted = compiled_positions(self.prediction)(found.params, data)
+        if step_bias and found.covariance is not None and outcome.state is not None:
+            bias, words = bias_of_step(self, found, outcome.state)
+            fields["message"] = "; ".join([fields["message"], *words])
+        return fields, bias, scene, state, predicted
+
+
+def _good(found: Fit) -> bool:
+    """Whether the fit leaves nothing to look for from another start."""
+    if not found.converged:
+        return False
+    if found.noise_ratio is not None and found.noise_ratio <= GOOD:
+        return True
+    return found.explained is not None and found.explained > 0.999

@@ -1,0 +1,87 @@
+"""How far the integrator's own error moves what a fit found."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler.fitting import least_squares
+from jeuler.fitting.least_squares import State
+from jeuler.fitting.prediction import Prediction, recording
+from jeuler.fitting.result import Fit
+from jeuler.fitting.unknowns import Layout, readable
+
+if TYPE_CHECKING:
+    from jeuler.fitting.recorded import Recorded
+
+TENTH = 0.1  # of a standard error: the least that is worth a word
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(prediction: Prediction) -> Callable:
+    return jax.jit(prediction)
+
+
+def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[str]]:
+    """The shift of each parameter by the integrator's error, and what is to be said about it.
+
+        shift = J^+ (r(dt) - r(0)),   r(0) = r(dt) + (r(dt / 2) - r(dt)) 2^q / (2^q - 1)
+
+    Args:
+      task: the recording with the scene.
+      found, state: the fit at dt, and where its search ended.
+    Returns: fitted minus what an exact integrator would give, of the structure of the params; and sentences.
+    Source: the extrapolation of L. F. Richardson; the projection is the Gauss-Newton step.
+    """
+    layout = Layout.of(found.params)
+    whole, half = _residuals(task, found, 1), _residuals(task, found, 2)
+    if not np.isfinite(half).all():
+        return None, [f"at dt = {task.dt / 2:g} the run is not finite, so the bias of the step is not known"]
+    with np.errstate(all="ignore"):
+        weights = np.where(whole.ravel() != 0, state.residual / whole.ravel(), 0)
+    order = getattr(task.prediction.step, "order", 1)
+    jump = 2**order / (2**order - 1)
+    shift = _shift(state, (half - whole).ravel() * jump * weights)
+    error = np.asarray(layout.vector(found.stderr), float)
+    share = np.where(np.isfinite(error) & (error > 0), np.abs(shift) / np.where(error > 0, error, 1), 0)
+    bias = layout.params(jnp.asarray(shift))
+    worst = int(np.argmax(share)) if share.size else 0
+    if not share.size or share[worst] <= TENTH:
+        return bias, []
+    advised = task.dt * min((TENTH / share[worst]) ** (1 / order), 0.5)
+    exponent = np.floor(np.log10(advised))
+    advised = np.floor(advised / 10 ** (exponent - 1)) * 10 ** (exponent - 1)
+    return bias, [
+        f"the integrator's error at dt = {task.dt:g} moves {layout.names(readable)[worst]} by {shift[worst]:.2g}, "
+        f"{share[worst]:.2g} standard errors (.step_bias): use dt = {advised:.2g}"
+    ]
+
+
+def _residuals(task: Recorded, found: Fit, parts: int) -> np.ndarray:
+    """The residual in steps of dt / parts, weighted as in the fit."""
+    steps = task.prediction.num_steps * parts
+    prediction = dataclasses.replace(task.prediction, num_steps=steps)
+    data = recording(
+        task.scene,
+        task.state,
+        task.times,
+        task.targets,
+        prediction.columns,
+        dt=task.dt / parts,
+        t0=task.t0,
+        num_steps=steps,
+    )
+    return np.asarray(_compiled(prediction)(found.params, data), float)
+
+
+def _shift(state: State, change: np.ndarray) -> np.ndarray:
+    """J^+ of a change of the weighted residual."""
+    q, triangle = least_squares.projected(state.jacobian, change, state.scale)
+    step = -least_squares.damped_solution(triangle, q, np.asarray(0.0))
+    return step / np.where(state.scale > 0, state.scale, 1)
