@@ -1,5 +1,7 @@
 """Births, deaths and the pool: what is counted, what is recycled, what a dead slot holds."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,6 +34,7 @@ from jeuler import (
 )
 from jeuler.effects.lifecycle import first_free
 from jeuler.particles.fields import uses
+from jeuler.particles.protocols import Context
 from jeuler.particles.state import empty_pool
 
 KEY = jax.random.key(7)
@@ -184,8 +187,10 @@ def test_springs_of_the_living_are_those_of_the_law_whatever_their_layout(kind, 
             f = (ks * (0.3 - r) - kd * np.dot(v[i] - v[j], d) / r) * d / r
             expected[i] += f
             expected[j] -= f
-    for force in (springs, springs.prepare(particles, jnp.float64)):
-        found = force.among(jnp.asarray(alive))(0.0, jnp.asarray(p), jnp.asarray(v), jnp.ones(()))
+    context = Context(particles, jnp.float64)
+    living = dataclasses.replace(context, alive=jnp.asarray(alive))
+    for force in (springs, springs.prepare(context)):
+        found = force.prepare(living)(0.0, jnp.asarray(p), jnp.asarray(v), jnp.ones(()))
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 

@@ -23,6 +23,7 @@ from jeuler import (
     Viscosity,
     Vortex,
     Wind,
+    euler_step,
     rk4_step,
     simulate,
     strand_edges,
@@ -30,6 +31,8 @@ from jeuler import (
 )
 from jeuler.forces.hair import share_of, smoothed, transported_frames
 from jeuler.forces.soft_body import rotation_of
+from jeuler.particles.equation import Equation
+from jeuler.particles.protocols import Context
 
 ONE = jnp.asarray(1.0)
 _force = jax.jit(lambda force, p, v, mass: force(0.0, p, v, mass))
@@ -154,7 +157,12 @@ def test_drag_never_overshoots_the_wind(name, dt):
 def test_drag_where_the_step_is_short_is_the_plain_force_to_the_last_bit(name, cloud):
     p, v = cloud
     drag = DRAGS[name](0.3, air=(Wind([1.0, 0.0, 0.0]), turbulence(dim=3, speed=0.2, size=1.0, modes=4)))
-    assert np.array_equal(at(drag, p, v), at(drag.for_step(jnp.asarray(0.01)), p, v))
+    for mass in (ONE, jnp.full(len(p), 2.0)):
+        motion = (p, v)
+        free = Scene((drag,)).vector_field(0.3, motion, mass)[1]
+        context = Context(len(p), p.dtype, jnp.asarray(0.01), euler_step)
+        found = Equation.of((drag,), (), context).vector_field(0.3, motion, mass)[1]
+        assert np.array_equal(found, free)
 
 
 def test_drag_in_a_wind_agrees_with_the_exact_solutions():

@@ -11,6 +11,7 @@ from jax import lax
 
 from jeuler._core import checks
 from jeuler._core.annotations import ColliderLike, Parameter, default
+from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import as_component, component, store_as_float
 from jeuler.contact.colliders import check_collider
 from jeuler.contact.impacts import Impacts, Path
@@ -34,8 +35,8 @@ class Collisions:
       restitution: 1 elastic, 0 no bounce, (). Differentiable.
       friction: Coulomb's coefficient, (). Differentiable.
       max_bounces: impacts of one particle that are followed within one step; the next one rests. Static.
-    Returns: called as an effect ``(t, dt, state, key)``, the state at the end of the step; in `simulate`, which knows
-      the state before the step, ``over_step(t, dt, previous, state, key)``.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state at the end of the step. Without
+      ``previous``, the state before the step is taken to be the one from which this velocity leads to this position.
     Raises: ValueError, if a value is out of its range; in `simulate`, if an index or a shape does not fit.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -70,12 +71,10 @@ class Collisions:
             if not checks.is_traced(value) and not bool(jnp.all((value >= 0) & (value <= most))):
                 raise ValueError(f"Collisions.{name} must be from 0 to {most}, got {value}")
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
-        before = dataclasses.replace(state, position=state.position - dt * state.velocity)
-        return self.over_step(t, dt, before, state, key)
-
-    def over_step(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
-        """The state after the step, given the state before it."""
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
+        if previous is None:
+            previous = dataclasses.replace(state, position=state.position - dt * state.velocity)
         x, v = previous.position, previous.velocity
         step = Impacts(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
         zero = jnp.zeros(len(x), x.dtype)

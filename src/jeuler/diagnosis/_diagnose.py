@@ -14,7 +14,7 @@ import numpy as np
 from jeuler._core import trees
 from jeuler._core.component import result
 from jeuler.diagnosis.rerun import Rerun, coincident, largest, lost_particles, springs_among
-from jeuler.particles.fields import name_of, with_required_fields
+from jeuler.particles.fields import name_of
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, euler_step
@@ -102,20 +102,19 @@ def diagnose(
 
     Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3.
     """
-    state = with_required_fields(state, scene.forces, scene.effects)
-    run = Rerun(scene, state, float(dt), float(t0), step, key)
-    return lost_value(run, num_steps) or (lost_gradient(run, num_steps, loss) if loss else None) or Diagnosis(True)
-
-
-def lost_value(run: Rerun, num_steps: int) -> Diagnosis | None:
-    """The first step whose result is not finite, and what in it, or None."""
-    for name, tree in (("state", run.state), ("scene", run.scene)):
+    for name, tree in (("state", state), ("scene", scene)):
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
             field = name + jax.tree_util.keystr(path)
             must_be_finite = field in ("state.position", "state.velocity")  # elsewhere inf may have a meaning
             found = before_the_run(field, leaf, ~np.isfinite(leaf) if must_be_finite else np.isnan(leaf))
             if found:
                 return found
+    run = Rerun.of(scene, state, num_steps, dt=dt, t0=t0, step=step, key=key)
+    return lost_value(run, num_steps) or (lost_gradient(run, num_steps, loss) if loss else None) or Diagnosis(True)
+
+
+def lost_value(run: Rerun, num_steps: int) -> Diagnosis | None:
+    """The first step whose result is not finite, and what in it, or None."""
     lost = int(run.solution(num_steps).first_nonfinite)
     return None if lost < 0 else inside_step(run, lost)
 
@@ -132,40 +131,47 @@ def before_the_run(field: str, leaf: Any, bad: np.ndarray) -> Diagnosis | None:
 def inside_step(run: Rerun, n: int) -> Diagnosis:
     """Which part of step n made the first number that is not finite, from the finite state before it."""
     start = before = run.before(n)
-    for part, before in run.effects(run.scene, n, start, start, early=True):
-        bad = lost_particles(before.alive, before.position, before.velocity)
+    for part, after in run.parts_of_step(n, start):
+        if part == name_of(run.step):
+            found = inside_motion(run, n, before)
+            if found:
+                return found
+        bad = lost_particles(after.alive, after.position, after.velocity)
         if bad:
             return explain(run, "value", n, part, bad, start)
+        before = after
+    return explain(run, "value", n, name_of(run.step), (), start)
+
+
+def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None:
+    """Which force, or what else in the motion of step n, is not finite, from the state that it starts from."""
     t, alive = run.time(n), before.alive
-    x, v = before.position, before.velocity
-    for k, force in enumerate(run.scene.forces):
-        bad = lost_particles(alive, run.force(force, t, before)(x, v))
+    for part, force in run.shares(t, before):
+        bad = lost_particles(alive, force)
         if not bad:
             continue
-        for path, leaf in jax.tree_util.tree_leaves_with_path(force):
+        k = index_of(part)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(run.scene.forces[k]):
             found = before_the_run(f"scene.forces[{k}]{jax.tree_util.keystr(path)}", leaf, ~np.isfinite(leaf))
             if found:
                 return found
-        part = f"forces[{k}] {name_of(force)}"
-        return explain(run, "value", n, part, bad, before, springs_among(force, before, bad))
-    attributes = run.scene.attributes(before)
-    bad = lost_particles(alive, run.scene.vector_field(t, (x, v), attributes)[1])
-    if bad and largest(x) < run.huge():
-        light = np.broadcast_to(before.mass, len(x))[bad[0]]
-        cause = f"force / mass overflows {x.dtype}: the mass is {light:.3g} kg"
+        return explain(run, "value", n, part, bad, before, springs_among(run.scene.forces[k], before, bad))
+    motion, attributes = (before.position, before.velocity), run.scene.attributes(before)
+    bad = lost_particles(alive, run.of_one.equation.vector_field(t, motion, attributes)[1])
+    if bad and largest(before.position) < run.huge():
+        light = np.broadcast_to(before.mass, len(before.position))[bad[0]]
+        cause = f"force / mass overflows {before.position.dtype}: the mass is {light:.3g} kg"
         remedy = "raise the mass, or pin the particle with mass = inf, or use float64"
         return Diagnosis(False, "value", n, "acceleration", bad, cause=cause, remedy=remedy)
-    for part, after in run.parts_of_step(run.scene, n, start):
-        bad = lost_particles(after.alive, after.position, after.velocity)
-        if bad and part == name_of(run.step) and hasattr(run.step, "with_info"):
-            dt = jnp.asarray(run.dt, x.dtype)
-            _, info = run.step.with_info(run.scene.vector_field, t, (x, v), dt, attributes)
+    if hasattr(run.step, "with_info"):
+        equation, dt = run.of_one.equation, run.of_one.grid.dt
+        after, info = run.step.with_info(equation.vector_field, t, motion, dt, attributes)
+        bad = lost_particles(alive, *after)
+        if bad:
             cause = f"its equation was not solved in {int(info.iterations)} iterations"
             remedy = "take a smaller dt, or implicit_euler(max_steps=..., damped_steps=..., rtol=...)"
-            return Diagnosis(False, "value", n, part, bad, cause=cause, remedy=remedy)
-        if bad:
-            return explain(run, "value", n, part, bad, before)
-    return explain(run, "value", n, name_of(run.step), (), before)
+            return Diagnosis(False, "value", n, name_of(run.step), bad, cause=cause, remedy=remedy)
+    return None
 
 
 def lost_gradient(run: Rerun, num_steps: int, loss: Callable) -> Diagnosis | None:
@@ -174,7 +180,7 @@ def lost_gradient(run: Rerun, num_steps: int, loss: Callable) -> Diagnosis | Non
 
     def after(scene, motion, n, before):
         before = dataclasses.replace(before, position=motion[0], velocity=motion[1])
-        *_, (_, state) = run.parts_of_step(scene, n, before)
+        *_, (_, state) = run.with_scene(scene).parts_of_step(n, before)
         return state.position, state.velocity
 
     @jax.jit
@@ -203,13 +209,20 @@ def lost_gradient(run: Rerun, num_steps: int, loss: Callable) -> Diagnosis | Non
 
 def lost_in_step(run: Rerun, n: int, before: ParticleState, cotangent: Any, bad: tuple[int, ...]) -> Diagnosis:
     """Which part of step n made the cotangent not finite."""
-    motion = before.position, before.velocity
-    for k, force in enumerate(run.scene.forces):
-        value, pullback = jax.vjp(lambda force, x, v: run.force(force, run.time(n), before)(x, v), force, *motion)
-        of_force, *of_motion = pullback(jnp.ones_like(value))
-        who = lost_particles(None, *of_motion)
-        if who or not bool(trees.all_finite(of_force)):
-            part, springs = f"forces[{k}] {name_of(force)}", springs_among(force, before, who)
+    before = run.before_motion(n, before)
+    t, motion = run.time(n), (before.position, before.velocity)
+
+    def force(scene, x, v, k):
+        moved = dataclasses.replace(before, position=x, velocity=v)
+        return dict(run.with_scene(scene).shares(t, moved))[k]
+
+    for part, _ in run.shares(t, before):
+        k = index_of(part)
+        value, pullback = jax.vjp(lambda scene, x, v, part=part: force(scene, x, v, part), run.scene, *motion)
+        of_scene, *of_motion = pullback(jnp.ones_like(value))
+        who = lost_particles(before.alive, *of_motion)
+        if who or not bool(trees.all_finite(of_scene.forces[k])):
+            springs = springs_among(run.scene.forces[k], before, who)
             return explain(run, "gradient", n, part, who, before, springs)
     if largest(cotangent) > np.sqrt(run.huge()):
         limit = run.limit()
@@ -219,6 +232,11 @@ def lost_in_step(run: Rerun, n: int, before: ParticleState, cotangent: Any, bad:
         return Diagnosis(False, "gradient", n, name_of(run.step), bad, cause=cause, remedy=remedy)
     parts = [f"effects[{k}] {name_of(effect)}" for k, effect in enumerate(run.scene.effects)]
     return explain(run, "gradient", n, " or ".join([name_of(run.step), *parts]), bad, before)
+
+
+def index_of(part: str) -> int:
+    """The index of a force in its scene, from a name such as "forces[1] Springs"."""
+    return int(part[part.index("[") + 1 : part.index("]")])
 
 
 def explain(

@@ -3,46 +3,51 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._core.component import replace
+from jeuler._core.components import stack
 from jeuler.forces import Springs
-from jeuler.particles._simulate import simulate
-from jeuler.particles.fields import declared, name_of
+from jeuler.particles._simulate import begin, simulate
+from jeuler.particles.fields import name_of
 from jeuler.particles.scene import Scene
-from jeuler.particles.state import ParticleState, zero_dead_slots
-from jeuler.solving._scan import Solution
+from jeuler.particles.state import ParticleState, split_state
+from jeuler.particles.step import SceneStep
+from jeuler.solving._scan import Solution, no_remainder
 from jeuler.steps.explicit import Step
 from jeuler.steps.stability import stability_limit
 
 
 @dataclasses.dataclass(frozen=True)
 class Rerun:
-    """The arguments of a run."""
+    """A run once more: the arguments that `simulate` got, and its step, which can be looked at part by part."""
 
     scene: Scene
+    given: ParticleState
+    arguments: dict[str, Any]
+    of_one: SceneStep
     state: ParticleState
-    dt: float
-    t0: float
-    step: Step
-    key: jax.Array | None
+
+    @classmethod
+    def of(cls, scene: Scene, state: ParticleState, num_steps: int, **arguments: Any) -> Rerun:
+        of_one, start = begin(scene, state, num_steps=num_steps, **arguments)
+        return cls(scene, state, arguments, of_one, start)
+
+    @property
+    def step(self) -> Step:
+        return self.of_one.step
+
+    @property
+    def dt(self) -> float:
+        return float(self.of_one.grid.dt)
 
     def solution(self, num_steps: int, save_every: int | None = None) -> Solution:
-        return simulate(
-            self.scene,
-            self.state,
-            dt=self.dt,
-            num_steps=num_steps,
-            t0=self.t0,
-            step=self.step,
-            key=self.key,
-            save_every=save_every or max(num_steps, 1),
-        )
+        save_every = save_every or max(num_steps, 1)
+        return simulate(self.scene, self.given, num_steps=num_steps, save_every=save_every, **self.arguments)
 
     def before(self, n: int) -> ParticleState:
         """The state before step n."""
@@ -50,51 +55,43 @@ class Rerun:
 
     def time(self, n: Any) -> Any:
         """The time at the start of step n."""
-        return self.t0 + (n - 1) * self.dt
+        return self.of_one.grid.clock(jnp.asarray(n, jnp.int32) - 1)
 
-    def force(self, force: Any, t: Any, state: ParticleState) -> Callable:
-        """One force by itself, as a function of position and velocity, with the fields of this state."""
-        if state.alive is not None and hasattr(force, "among"):
-            force = force.among(state.alive)
-        own = {name: getattr(state, name) for name in declared(force, "reads")}
-        return lambda position, velocity: force(t, position, velocity, state.mass, **own)
+    def with_scene(self, scene: Scene) -> Rerun:
+        """The same run of a scene with other parameters."""
+        grid, key, of_one = self.of_one.grid, self.of_one.key, self.of_one
+        other = SceneStep.of(scene, self.state, grid, of_one.step, key, compensated=of_one.compensated)
+        return dataclasses.replace(self, scene=scene, of_one=other)
 
-    def effects(self, scene: Scene, n: Any, before: ParticleState, state: ParticleState, *, early: bool) -> Iterator:
-        """The state after each of the effects of step n that come before the motion, or after it, with their names."""
-        dt = jnp.asarray(self.dt, state.position.dtype)
-        t = jnp.asarray(self.time(n if early else n + 1), dt.dtype)
-        for k, effect in enumerate(scene.effects):
-            if declared(effect, "before_motion", False) == early:
-                own_key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n - 1), k)
-                if hasattr(effect, "over_step"):
-                    state = effect.over_step(t, dt, before, state, own_key)
-                else:
-                    state = effect(t, dt, state, own_key)
-                yield f"effects[{k}] {name_of(effect)}", state
+    def parts_of_step(self, n: Any, before: ParticleState) -> Iterator[tuple[str, ParticleState]]:
+        """The name of each part of step n and the state after it."""
+        parts = split_state(before)
+        carried = parts, no_remainder(parts[0], self.of_one.compensated)
+        n = jnp.asarray(n, jnp.int32)
+        for name, moment, _ in self.of_one.parts(n - 1, self.time(n), carried):
+            yield name, moment.state
 
-    def parts_of_step(self, scene: Scene, n: Any, before: ParticleState) -> Iterator[tuple[str, ParticleState]]:
-        """The state after each effect and after the step function of step n, with the name of what was applied."""
-        dt = jnp.asarray(self.dt, before.position.dtype)
-        scene, state = scene.for_step(dt), before
-        for part, state in self.effects(scene, n, before, before, early=True):
-            yield part, state
-        before, motion = state, (state.position, state.velocity)
-        t = jnp.asarray(self.time(n), dt.dtype)
-        x, v = self.step(scene.vector_field, t, motion, dt, scene.attributes(before))
-        state = replace(before, position=x, velocity=v)
-        yield name_of(self.step), state
-        moved = state
-        for part, state in self.effects(scene, n, before, moved, early=False):
-            yield part, state
-        if state.alive is not None:
-            yield "dead slots", zero_dead_slots(state)
+    def before_motion(self, n: int, state: ParticleState) -> ParticleState:
+        """The state that step n moves on, after births and deaths, of the one that it starts from."""
+        for name, after in self.parts_of_step(n, state):
+            if name == name_of(self.step):
+                break
+            state = after
+        return state
+
+    def shares(self, t: Any, state: ParticleState) -> Iterator[tuple[str, jax.Array]]:
+        """The name of each force of the step, and what it adds to the sum, (particle, dim)."""
+        equation, motion = self.of_one.equation, (state.position, state.velocity)
+        attributes, x, v = equation.moving(t, motion, self.scene.attributes(state))
+        for share in equation.shares(t, x, v, attributes):
+            yield share.name, stack(share.force)
 
     def limit(self) -> float:
-        """The stability limit at the initial state; inf where it cannot be found."""
+        """The stability limit at the initial state; inf where it cannot be found. A drag that is limited sets none."""
         motion = self.state.position, self.state.velocity
         try:
             attributes = self.scene.attributes(self.state)
-            return stability_limit(self.scene.vector_field, self.t0, motion, attributes, step=self.step)
+            return stability_limit(self.scene.vector_field, self.of_one.grid.t0, motion, attributes, step=self.step)
         except ValueError:
             return np.inf
 

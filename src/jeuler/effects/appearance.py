@@ -10,9 +10,11 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.annotations import OptionalParameter, Parameter, default
+from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import component, store_as_float
 from jeuler._core.components import per_particle
 from jeuler._core.vectors import direction
+from jeuler.particles.fields import START
 from jeuler.particles.state import DEFAULTS
 
 
@@ -29,7 +31,8 @@ class OverLife:
       values: (key, ...), what the field is at the keys. Differentiable.
       times: (key,), the keys' shares of life, increasing, 0 at birth and 1 at death; None spaces them evenly.
       duration: () s, the same span for all; None takes ``state.lifetime``.
-    Returns: called as an effect ``(t, dt, state, key)``, the state with the field of each particle at its age.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state with the field of each particle at
+      its age.
     Raises: ValueError, if values and times differ in length or times do not increase; in `simulate`, if nothing in the
       scene provides age (a `Lifetime` does) or lifetime, or another effect writes the field.
     Example:
@@ -46,6 +49,8 @@ class OverLife:
     values: Parameter
     times: OptionalParameter = default(None)
     duration: OptionalParameter = default(None)
+
+    acts = START
 
     def __post_init__(self) -> None:
         if self.field == "shape":
@@ -67,17 +72,11 @@ class OverLife:
         return ("age",) if self.duration is not None else ("age", "lifetime")
 
     @property
-    def sets(self) -> tuple[str, ...]:
-        return (self.field,)
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
+    def sets(self) -> dict[str, tuple[int, ...]]:
         return {self.field: self.values.shape[1:]}
 
-    def at_start(self, t: Any, state: Any) -> Any:
-        return self(t, 0.0, state, None)
-
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         field = getattr(state, self.field)
         life = state.lifetime if self.duration is None else self.duration
         life = jnp.where(life > 0, life, 1)  # a dead slot has none
@@ -117,7 +116,7 @@ class SpeedLimit:
 
     Args:
       limit: () or (particle,), m/s, >= 0. Differentiable.
-    Returns: called as an effect ``(t, dt, state, key)``, the state with slower velocities.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state with slower velocities.
     Raises: ValueError, if a limit is negative; in `simulate`, if it has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -136,7 +135,8 @@ class SpeedLimit:
         if not checks.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
             raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {self.limit.min()}")
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         speed, heading = direction(state.velocity)
         limit = per_particle(self.limit)
         slow = jnp.where(speed > limit, limit * heading, state.velocity)

@@ -11,8 +11,11 @@ from jax import Array, lax
 
 from jeuler._core import checks, trees
 from jeuler._core.annotations import ColliderParameter, OptionalParameter, Parameter, SampledParameter, default
+from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import as_component, component, store_as_float
 from jeuler._core.components import by_component
+from jeuler.contact.colliders import check_collider
+from jeuler.particles.fields import BEFORE
 from jeuler.particles.state import COUNTERS, DEFAULTS
 from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
 
@@ -40,7 +43,8 @@ class Emitter:
       bursts: pairs (time in s, number of births). Static.
       start, stop: the stream runs from start to stop, s.
       max_births: the most births in one step, an integer; fewer draws cost less. None allows the whole pool. Static.
-    Returns: called as an effect ``(t, dt, state, key)``, the state with the births of the step from t to t + dt.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state with the births of the step from t
+      to t + dt.
     Raises: ValueError, if rate is negative, a burst is not a pair (time, number) or max_births is below 1; in
       `simulate`, if it got no key, or a sampler's shape does not fit.
     Example:
@@ -69,7 +73,7 @@ class Emitter:
     stop: Parameter = default(jnp.inf)
     max_births: int | None = None
 
-    before_motion = True
+    acts = BEFORE
     random = True
 
     def __post_init__(self) -> None:
@@ -99,17 +103,14 @@ class Emitter:
         return {**named, **(self.extra or {})}
 
     @property
-    def writes(self) -> tuple[str, ...]:
-        return ("alive", *COUNTERS, *self.samplers)
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """The shape of one particle's value in each further field."""
+    def writes(self) -> dict[str, tuple[int, ...]]:
+        """The fields, with the shape of one particle's value in those that are not the library's own."""
 
         def one(sampler):
             return jax.eval_shape(lambda key: draw(sampler, key, 1), jax.random.key(0)).shape[1:]
 
-        return {name: one(sampler) for name, sampler in (self.extra or {}).items()}
+        further = {name: one(sampler) for name, sampler in (self.extra or {}).items()}
+        return {**dict.fromkeys(("alive", *COUNTERS, *self.samplers), ()), **further}
 
     def number_of_births(self, t: Any, dt: Any) -> Array:
         """Births in the step that starts at t. The integer step number comes from the clock, so no birth is lost."""
@@ -120,7 +121,8 @@ class Emitter:
         burst = sum(jnp.where(step_number(time, dt) == n, number, 0) for time, number in self.bursts)
         return (stream + burst).astype(jnp.int32)
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Array) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Array) -> Any:
         capacity = len(state.position)
         block = min(self.max_births or capacity, capacity)
         slot, free = first_free(state.alive, block)
@@ -198,7 +200,7 @@ class Lifetime:
 
     Args:
       duration: the same lifetime for all, (), s, > 0; None takes ``state.lifetime``, which an `Emitter` draws.
-    Returns: called as an effect ``(t, dt, state, key)``, the state with deaths and ages.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state with deaths and ages.
     Raises: ValueError, if the duration is not above 0.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -212,7 +214,7 @@ class Lifetime:
 
     duration: OptionalParameter = default(None)
 
-    before_motion = True
+    acts = BEFORE
     sets: ClassVar[tuple[str, ...]] = ("age",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
@@ -225,7 +227,8 @@ class Lifetime:
     def reads(self) -> tuple[str, ...]:
         return () if self.duration is not None else ("lifetime",)
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         limit = state.lifetime if self.duration is None else self.duration
         small = 1e-3 * dt  # ages are sums of dt: a lifetime of three steps ends after three, not four
         return state.replace(
@@ -239,7 +242,7 @@ class Death:
 
     Args:
       condition: a function ``condition(t, state) -> (particle,)`` boolean. Static.
-    Returns: called as an effect ``(t, dt, state, key)``, the state without the particles for which it holds.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state without the particles for which it holds.
     Raises: nothing of its own.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -254,10 +257,11 @@ class Death:
 
     condition: Callable[[Any, Any], Array]
 
-    before_motion = True
+    acts = BEFORE
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         return state.replace(alive=state.alive & ~self.condition(t, state))
 
 
@@ -268,7 +272,7 @@ class DeathOutside:
     Args:
       low: (dim,) or (), m; -inf leaves a side open.
       high: (dim,) or (), m.
-    Returns: called as an effect ``(t, dt, state, key)``, the state without the particles outside.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state without the particles outside.
     Raises: ValueError, in `simulate`, if a bound has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -284,13 +288,14 @@ class DeathOutside:
     low: Parameter
     high: Parameter
 
-    before_motion = True
+    acts = BEFORE
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
         store_as_float(self, "low", "high")
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         inside = jnp.all((state.position >= self.low) & (state.position <= self.high), axis=1)
         return state.replace(alive=state.alive & inside)
 
@@ -309,8 +314,8 @@ class DeathOnContact:
       collider: the signed distance ``collider(t, point) -> ()`` of one point (dim,), m, negative inside; what
         `Collisions` takes too.
       margin: (), m, how near is contact.
-    Returns: called as an effect ``(t, dt, state, key)``, the state without the particles in contact.
-    Raises: nothing of its own.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state without the particles in contact.
+    Raises: ValueError, in `simulate`, if the collider is of another dimension, or the margin is not one number.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> ground = jeuler.DeathOnContact(lambda t, p: p[1])
@@ -325,13 +330,18 @@ class DeathOnContact:
     collider: ColliderParameter
     margin: Parameter = default(0.0)
 
-    before_motion = True
+    acts = BEFORE
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "collider", as_component(self.collider))
         store_as_float(self, "margin")
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         distance = jax.vmap(self.collider, (None, 0))(t, state.position)
         return state.replace(alive=state.alive & (distance > self.margin))
+
+    def check(self, particles: int, dim: int) -> None:
+        checks.shape("DeathOnContact.margin", self.margin.shape, ())
+        check_collider(self.collider, dim)

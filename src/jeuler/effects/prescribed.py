@@ -11,6 +11,7 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.annotations import MovingParameter, Parameter, ParticleIndices
+from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import as_component, component, replace, store_as_float
 from jeuler._core.interpolate import interpolate, slopes
 
@@ -64,7 +65,8 @@ class PrescribedMotion:
       particles: indices of the prescribed particles, integers (prescribed,). Static.
       path: a function ``path(t) -> (prescribed, dim)`` in m, or a `SampledPath`. A path that is a pytree, such as
         `SampledPath` or ``jax.tree_util.Partial``, is differentiable in its leaves.
-    Returns: called as an effect ``(t, dt, state, key)``, the state with these particles on their path at time t.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state with these particles on their path
+      at time t.
     Raises: ValueError, in `simulate`, if an index is out of range or repeated, or the path has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -85,28 +87,21 @@ class PrescribedMotion:
         object.__setattr__(self, "particles", particles)
         object.__setattr__(self, "path", as_component(self.path))
 
-    def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
-        """Position and velocity with the prescribed ones put in."""
-        p, v = self._position_and_velocity(t, position.dtype)
-        return self._put(position, p), self._put(velocity, v)
+    def prescribe(self, t: Any, dtype: Any) -> tuple[Any, Array, Array, Array]:
+        """Indices, position, velocity and acceleration of the particles at time t."""
 
-    def constrain_slope(self, t: Any, velocity: Array, acceleration: Array) -> tuple[Array, Array]:
-        """Velocity and acceleration with the prescribed ones put in."""
-        one = jnp.ones_like(jnp.asarray(t))
-        v, a = jax.jvp(lambda t: self._position_and_velocity(t, velocity.dtype)[1], (t,), (one,))
-        return self._put(velocity, v), self._put(acceleration, a)
+        def motion(t):
+            return jax.jvp(self.path, (t,), (jnp.ones_like(t),))
 
-    def __call__(self, t: Any, dt: Any, state: Any, key: Any) -> Any:
-        position, velocity = self.constrain(t, state.position, state.velocity)
-        return replace(state, position=position, velocity=velocity)
-
-    def _position_and_velocity(self, t: Any, dtype: Any) -> tuple[Array, Array]:
         t = jnp.asarray(t)
-        p, v = jax.jvp(self.path, (t,), (jnp.ones_like(t),))
-        return p.astype(dtype), v.astype(dtype)
+        (p, v), (_, a) = jax.jvp(motion, (t,), (jnp.ones_like(t),))
+        return self.particles, p.astype(dtype), v.astype(dtype), a.astype(dtype)
 
-    def _put(self, x: Array, values: Array) -> Array:
-        return x.at[jnp.array(self.particles, int)].set(values)
+    @previous_is_optional
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
+        indices, p, v, _ = self.prescribe(t, state.position.dtype)
+        at = jnp.array(indices, int)
+        return replace(state, position=state.position.at[at].set(p), velocity=state.velocity.at[at].set(v))
 
     def check(self, particles: int, dim: int) -> None:
         indices = self.particles

@@ -2,47 +2,165 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.annotations import AirParameter, OptionalParameter, Parameter, default
-from jeuler._core.component import component, replace, store_as_float
-from jeuler._core.components import by_component, split, stack
+from jeuler._core.annotations import AirParameter, Parameter, default
+from jeuler._core.component import component, store_as_float
+from jeuler._core.components import split, stack
+from jeuler._core.vectors import dot, total
 from jeuler.forces.air import air_velocity, as_air, check_air
 
 
-def through_air(air: tuple[Any, ...], t: Any, position: Array, velocity: Array) -> Array:
-    """The velocity of each particle relative to the air, (particle, dim)."""
-    return by_component(jnp.subtract, velocity, jnp.asarray(air_velocity(air, t, position))) if air else velocity
+class Resistance(NamedTuple):
+    """A drag at one time and place, -c u - q |u| u with u = v - w, by component.
 
-
-def unless_too_long(rate: Array, dt: Array) -> Array:
-    """min(1, 1 / (rate dt)): by how much a force that slows at this rate (1/s) must shrink not to overshoot in dt.
-
-    Exactly 1 where rate dt <= 1: there the force is the plain one, to the last bit, and the order of a step is kept.
+    Attributes:
+      linear: c, () or (particle,), kg/s; None where there is none.
+      quadratic: q, () or (particle,), kg/m; None where there is none.
+      air: w, one array (particle,) a component, m/s; None for air at rest.
     """
-    steps = rate * dt.astype(rate.dtype)
-    too_long = steps > 1
-    return jnp.where(too_long, 1 / jnp.where(too_long, steps, 1), 1)
+
+    linear: Any = None
+    quadratic: Any = None
+    air: Any = None
+
+    def force(self, v: Sequence[Array]) -> list[Array]:
+        """The force on each particle, one array (particle,) a component, N."""
+        u = self.relative(v)
+        parts = [] if self.linear is None else [[-self.linear * one for one in u]]
+        if self.quadratic is not None:
+            speed = length(u)
+            parts.append([-self.quadratic * speed * one for one in u])
+        return [total(terms) for terms in zip(*parts, strict=True)]
+
+    def relative(self, v: Sequence[Array]) -> Sequence[Array]:
+        """u, the velocity through the air."""
+        return v if self.air is None else [a - b for a, b in zip(v, self.air, strict=True)]
+
+
+def length(u: Sequence[Array]) -> Array:
+    """|u|; 0 at u = 0 with its derivative."""
+    return root(dot(u, u))
+
+
+def root(x: Array) -> Array:
+    """The square root of x >= 0; 0 at 0 with its derivative."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
+
+
+def inertia(mass: Array, dt: Array, drags: Sequence[Resistance], v: Sequence[Array], others: Sequence[Array]) -> Array:
+    """max(m, dt kappa): the mass with which an explicit first-order step of dt does not overshoot, kg.
+
+        v' = v + dt F / max(m, dt kappa)
+
+    F is the sum of all forces, and kappa (`stiffness`) bounds how fast the drags among them change with the velocity.
+    Let v* be the velocity at which they balance the other forces, which are held for the step. F is the slope of a
+    convex function, so F.(v* - v) <= kappa |v* - v|^2: the step does not go beyond v*, and F = 0 there alone. Where
+    dt kappa <= m this is m to the last bit.
+    """
+    least = dt.astype(mass.dtype) * stiffness(drags, v, others)
+    return jnp.where((least > mass) & jnp.isfinite(least), least, mass)
+
+
+def stiffness(drags: Sequence[Resistance], v: Sequence[Array], others: Sequence[Array]) -> Array:
+    """kappa, kg/s: drag changes by no more than kappa |v - v*| between v and v*, where it balances the other forces.
+
+        linear drags alone               kappa = c = sum c_i
+        quadratic ones in one wind w     kappa = c/2 + q |v - w| + sqrt(c^2 + 4 q G) / 2,   q = sum q_j
+        in several winds w_j             kappa = c/2 + sum q_j |v - w_j| + 2 B + sqrt((c - 2 B)^2 + 4 q G) / 2
+
+    with w = sum q_j w_j / q, B = sum q_j |w_j - w| and G the size of all forces at the velocity w. In one wind the
+    square root is the solution of (c + q |v* - w|) |v* - w| = G, so that a particle that moves along v* - w gets to v*
+    in one step; in several it is a bound.
+
+    |u| u is Lipschitz with |u| + |u*|, and |v* - w_j| <= R + |w_j - w|, where q R^2 + (c - 2 B) R = G bounds |v* - w|:
+    (|a| a - |b| b).(a - b) >= r^3 - 2 |b| r^2 for r = |a - b|.
+    """
+    c = total(d.linear for d in drags if d.linear is not None) if any(d.linear is not None for d in drags) else 0
+    quadratic = [d for d in drags if d.quadratic is not None]
+    if not quadratic:
+        return jnp.asarray(c)
+    q, w, winds = _mean_wind(quadratic)
+    slope = total(d.quadratic * length(d.relative(v)) for d in quadratic)
+    spread = total(d.quadratic * length(wind) for d, wind in zip(quadratic, winds, strict=True)) if winds else 0
+    at_w = [zero + share for zero, share in zip(_drag_at(w, drags, v), others, strict=True)]
+    both = q * length(at_w)
+    if isinstance(c, int) and not winds:
+        return slope + root(both)
+    return c / 2 + slope + 2 * spread + root((c - 2 * spread) ** 2 + 4 * both) / 2
+
+
+def _mean_wind(quadratic: Sequence[Resistance]) -> tuple[Array, Sequence[Array] | None, list]:
+    """q, the mean wind w of quadratic drags (None: 0), and w_j - w of each; none of these where there is one wind."""
+    q = total(d.quadratic for d in quadratic)
+    blowing = [d for d in quadratic if d.air is not None]
+    if len(quadratic) == 1 or not blowing:
+        return q, quadratic[0].air, []
+    safe = jnp.where(q > 0, q, 1)
+    w = [total(d.quadratic * d.air[k] for d in blowing) / safe for k in range(len(blowing[0].air))]
+    return (
+        q,
+        w,
+        [[-b for b in w] if d.air is None else [a - b for a, b in zip(d.air, w, strict=True)] for d in quadratic],
+    )
+
+
+def _drag_at(w: Sequence[Array] | None, drags: Sequence[Resistance], v: Sequence[Array]) -> Sequence[Any]:
+    """The drags at the velocity w, by component; 0 where none acts there."""
+    drags = [d for d in drags if d.air is not w]
+    if not drags:
+        return [0] * len(v)
+    at = [jnp.zeros_like(one) for one in v] if w is None else w
+    return [total(terms) for terms in zip(*(d.force(at) for d in drags), strict=True)]
+
+
+class _Drag:
+    """What the drags share."""
+
+    coefficient: Array
+    air: Any
+
+    def __post_init__(self) -> None:
+        store_as_float(self, "coefficient")
+        object.__setattr__(self, "air", as_air(self.air))
+
+    def drag(self, t: Any, position: Array) -> Resistance:
+        raise NotImplementedError
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        return stack(self.drag(t, position).force(split(velocity)))
+
+    def _at(self, t: Any, position: Array) -> tuple[Array, Sequence[Array] | None]:
+        """The coefficient, and the velocity of the air by component."""
+        air = split(jnp.asarray(air_velocity(self.air, t, position))) if self.air else None
+        return self.coefficient.astype(position.dtype), air
+
+    def check(self, particles: int, dim: int) -> None:
+        name = type(self).__name__
+        checks.shape(f"{name}.coefficient", self.coefficient.shape, (), (particles,), meaning="one a particle")
+        check_air(name, self.air, particles, dim)
 
 
 @component(positive=("coefficient",))
-class LinearDrag:
+class LinearDrag(_Drag):
     """Drag in proportion to the speed relative to the air (Stokes drag).
 
         F_i = -c (v_i - w(p_i, t)),   for a sphere of radius r in a fluid of viscosity mu: c = 6 pi mu r
 
-    In `simulate` no particle overshoots the air, at any dt: where c dt / m > 1 the force is the one that takes the
-    particle to the speed of the air within the step.
+    An explicit first-order step (`euler_step`, `symplectic_euler_step`) of `simulate` with c dt / m > 1 would overshoot
+    the velocity at which drag balances the other forces. It gets there instead: all drags of the scene together, and
+    the forces beside them, act on max(m, c dt) in place of m. Every equilibrium stays where it is; where c dt <= m, and
+    under every other step, the force is as above.
 
     Args:
       coefficient: c, shape () or (particle,), kg/s, >= 0. Differentiable.
       air: the velocity w of the air: None at rest, (dim,) m/s, a field such as `Wind`, `Gust`, `Vortex` or
         `turbulence(...)`, any function ``air(t, position) -> (particle, dim)``, or a tuple of these, which add up.
-      longest_step: set by `simulate`, s.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, in `simulate`, if the coefficient or the air has another shape.
     Example:
@@ -56,40 +174,29 @@ class LinearDrag:
 
     coefficient: Parameter
     air: AirParameter = default(None)
-    longest_step: OptionalParameter = default(None)
 
-    def __post_init__(self) -> None:
-        store_as_float(self, "coefficient")
-        object.__setattr__(self, "air", as_air(self.air))
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        c = self.coefficient.astype(position.dtype)
-        if self.longest_step is not None:
-            c = c * unless_too_long(c / mass, self.longest_step)
-        return by_component(lambda u: -c * u, through_air(self.air, t, position, velocity))
-
-    def for_step(self, dt: Array) -> LinearDrag:
-        return replace(self, longest_step=dt)
-
-    def check(self, particles: int, dim: int) -> None:
-        check_coefficient("LinearDrag", self.coefficient, particles)
-        check_air("LinearDrag", self.air, particles, dim)
+    def drag(self, t: Any, position: Array) -> Resistance:
+        """What `simulate` must know of the drag so that a step does not overshoot."""
+        c, air = self._at(t, position)
+        return Resistance(linear=c, air=air)
 
 
 @component(positive=("coefficient",))
-class QuadraticDrag:
+class QuadraticDrag(_Drag):
     """Drag in proportion to the square of the speed relative to the air.
 
         F_i = -c |u| u,   u = v_i - w(p_i, t),   for a body of area A in a fluid of density rho: c = rho C_d A / 2
 
-    In `simulate` no particle overshoots the air, at any dt: where c |u| dt / m > 1 the force is the one that takes
-    the particle to the speed of the air within the step.
+    An explicit first-order step (`euler_step`, `symplectic_euler_step`) of `simulate` with c (|u| + |u*|) dt / m > 1
+    would overshoot u*, the velocity relative to the air at which drag balances the other forces. It does not: all
+    forces of the scene act on max(m, c (|u| + |u*|) dt) in place of m, and a particle that moves along u* gets there in
+    one step. Every equilibrium stays where it is; where the limit does not bind, and under every other step, the force
+    is as above.
 
     Args:
       coefficient: c, shape () or (particle,), kg/m, >= 0. Differentiable.
       air: the velocity w of the air: None at rest, (dim,) m/s, a field such as `Wind`, `Gust`, `Vortex` or
         `turbulence(...)`, any function ``air(t, position) -> (particle, dim)``, or a tuple of these, which add up.
-      longest_step: set by `simulate`, s.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
       At the speed of the air the force and its derivative are zero.
     Raises: ValueError, in `simulate`, if the coefficient or the air has another shape.
@@ -103,29 +210,8 @@ class QuadraticDrag:
 
     coefficient: Parameter
     air: AirParameter = default(None)
-    longest_step: OptionalParameter = default(None)
 
-    def __post_init__(self) -> None:
-        store_as_float(self, "coefficient")
-        object.__setattr__(self, "air", as_air(self.air))
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        relative = split(through_air(self.air, t, position, velocity))
-        square = sum(u * u for u in relative)
-        moving = square > 0
-        speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1)), 0)
-        c = self.coefficient.astype(position.dtype)
-        if self.longest_step is not None:
-            c = c * unless_too_long(c * speed / mass, self.longest_step)
-        return stack([-c * speed * u for u in relative])  # of one split, or gradients would be (particle, dim)
-
-    def for_step(self, dt: Array) -> QuadraticDrag:
-        return replace(self, longest_step=dt)
-
-    def check(self, particles: int, dim: int) -> None:
-        check_coefficient("QuadraticDrag", self.coefficient, particles)
-        check_air("QuadraticDrag", self.air, particles, dim)
-
-
-def check_coefficient(name: str, coefficient: Array, particles: int) -> None:
-    checks.shape(f"{name}.coefficient", coefficient.shape, (), (particles,), meaning="one a particle")
+    def drag(self, t: Any, position: Array) -> Resistance:
+        """What `simulate` must know of the drag so that a step does not overshoot."""
+        c, air = self._at(t, position)
+        return Resistance(quadratic=c, air=air)

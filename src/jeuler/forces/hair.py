@@ -5,6 +5,7 @@ The stretch springs of a strand are ordinary `Springs` between neighbours (`stra
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -13,8 +14,8 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks
-from jeuler._core.annotations import OptionalParameter, Parameter, ParticleIndices, default
-from jeuler._core.component import component, replace, store_as_float
+from jeuler._core.annotations import Parameter, ParticleIndices
+from jeuler._core.component import component, store_as_float
 from jeuler._core.indices import Indices
 from jeuler._core.vectors import direction
 
@@ -96,10 +97,9 @@ class _OnStrands:
         store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
         check_strands(type(self).__name__, self.strands, self.rest_position)
 
-    def among(self, alive: Array) -> Any:
-        """Only strands that live as a whole."""
-        here = jnp.all(alive[np.asarray(self.strands)], axis=1)
-        return replace(self, here=here.astype(self.rest_position.dtype))
+    def prepare(self, context: Any) -> Any:
+        """Only strands that live as a whole: a strand of which a node died has no bending and no core."""
+        return self if context.alive is None else functools.partial(self.__call__, alive=context.alive)  # type: ignore[operator]
 
     def check(self, particles: int, dim: int) -> None:
         checks.indices(f"{type(self).__name__}.strands", self.strands, particles, "particle indices")
@@ -123,7 +123,6 @@ class StrandBending(_OnStrands):
       stiffness: k, (), N/m. Differentiable.
       damping: c, (), N s/m. Differentiable.
       smoothing: length over which the strand is smoothed, (), m, > 0; longer than a coil. Differentiable.
-      here: set by a scene with deaths, (strand,): a strand bends only while all of it lives.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, 3), N.
     Raises: ValueError, if the rest shape and the indices disagree; in `simulate`, if space is not of dim 3.
     Example:
@@ -142,9 +141,8 @@ class StrandBending(_OnStrands):
     stiffness: Parameter
     damping: Parameter
     smoothing: Parameter
-    here: OptionalParameter = default(None)
 
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, *, alive: Array | None = None) -> Array:
         nodes = np.asarray(self.strands)
         rest = jnp.diff(self.rest_position, axis=1).astype(position.dtype)
         share = share_of(self.smoothing, rest)
@@ -157,7 +155,7 @@ class StrandBending(_OnStrands):
         _, u = direction(e[:, 1:])
         across = dv[:, 1:] - jnp.sum(dv[:, 1:] * u, axis=-1, keepdims=True) * u
         pull = self.stiffness * (e[:, 1:] - target) + self.damping * across
-        return give_to_ends(pull.astype(position.dtype), self.here, nodes[:, 1:], position)
+        return give_to_ends(pull.astype(position.dtype), alive, nodes, position)
 
 
 @component(static=("strands",), positive=("stiffness", "damping", "smoothing"))
@@ -174,7 +172,6 @@ class StrandCore(_OnStrands):
       stiffness: k, (), N/m. Differentiable.
       damping: c, (), N s/m. Differentiable.
       smoothing: length over which the strand is smoothed, (), m, > 0; longer than a coil. Differentiable.
-      here: set by a scene with deaths, (strand,): a strand has a core only while all of it lives.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, 3), N.
     Raises: ValueError, if the rest shape and the indices disagree; in `simulate`, if space is not of dim 3.
     Example:
@@ -193,9 +190,8 @@ class StrandCore(_OnStrands):
     stiffness: Parameter
     damping: Parameter
     smoothing: Parameter
-    here: OptionalParameter = default(None)
 
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, *, alive: Array | None = None) -> Array:
         nodes = np.asarray(self.strands)
         rest = jnp.diff(self.rest_position, axis=1).astype(position.dtype)
         share = share_of(self.smoothing, rest)
@@ -204,13 +200,17 @@ class StrandCore(_OnStrands):
         rate = smoothed(jnp.diff(velocity[nodes], axis=1), share)
         approach = jnp.sum(rate * u, axis=-1, keepdims=True)
         pull = (self.stiffness * (length - rest_length) + self.damping * approach) * u
-        return give_to_ends(pull.astype(position.dtype), self.here, nodes, position)
+        return give_to_ends(pull.astype(position.dtype), alive, nodes, position)
 
 
-def give_to_ends(pull: Array, here: Array | None, nodes: np.ndarray, position: Array) -> Array:
-    """Each edge's pull, (strand, edge, 3), to its first node, and the opposite to its second: (particle, 3)."""
-    if here is not None:
-        pull = here.astype(pull.dtype)[:, None, None] * pull
+def give_to_ends(pull: Array, alive: Array | None, nodes: np.ndarray, position: Array) -> Array:
+    """Each edge's pull, (strand, edge, 3), to its first node, and the opposite to its second: (particle, 3).
+
+    The edges are the last of their strand of nodes, (strand, node); one of which a node is dead exerts no pull.
+    """
+    if alive is not None:
+        pull = jnp.all(alive[nodes], axis=1).astype(pull.dtype)[:, None, None] * pull
+    nodes = nodes[:, -pull.shape[1] - 1 :]
     ends = jnp.pad(pull, ((0, 0), (0, 1), (0, 0))) - jnp.pad(pull, ((0, 0), (1, 0), (0, 0)))
     return jnp.zeros_like(position).at[nodes.reshape(-1)].add(ends.reshape(-1, 3))
 

@@ -50,9 +50,11 @@ class Viscosity:
         c = c[:, None] if c.ndim else c
         return self.edges.accumulate(-c * self.edges.difference(velocity), len(position))
 
-    def among(self, alive: Array) -> Viscosity:
+    def prepare(self, context: Any) -> Viscosity:
         """Only between the living."""
-        return replace(self, coefficient=only_among(alive, self.edges, self.coefficient))
+        if context.alive is None:
+            return self
+        return replace(self, coefficient=only_among(context.alive, self.edges, self.coefficient))
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
@@ -127,9 +129,11 @@ class Bending:
         theta, _, _ = angle_from(e, f, jnp.sum(e * f, axis=1))
         return jnp.sum(self.stiffness * (theta - self.rest_angle) ** 2) / 2
 
-    def among(self, alive: Array) -> Bending:
+    def prepare(self, context: Any) -> Bending:
         """Only between the living."""
-        return replace(self, stiffness=only_among(alive, self.triples, self.stiffness))
+        if context.alive is None:
+            return self
+        return replace(self, stiffness=only_among(context.alive, self.triples, self.stiffness))
 
     def check(self, particles: int, dim: int) -> None:
         checks.indices("Bending.triples", self.triples, particles, "particle indices")

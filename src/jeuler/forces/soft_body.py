@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,8 +13,8 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks
-from jeuler._core.annotations import OptionalParameter, Parameter, ParticleIndices, default
-from jeuler._core.component import component, replace, store_as_float
+from jeuler._core.annotations import Parameter, ParticleIndices, default
+from jeuler._core.component import component, store_as_float
 from jeuler._core.indices import Indices
 
 
@@ -83,7 +85,6 @@ class ShapeMatching:
       rest_position: the rest shape, (body particle, dim), m. Differentiable.
       stiffness: (), N/m. Differentiable.
       damping: (), N s/m, of the motion within the body. Differentiable.
-      here: set by a scene with deaths, (body particle,): 1 for the living and 0 for the dead.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if the rest shape and the indices disagree; in `simulate`, if an index is out of range.
     Example:
@@ -101,7 +102,6 @@ class ShapeMatching:
     rest_position: Parameter
     stiffness: Parameter
     damping: Parameter = default(0.0)
-    here: OptionalParameter = default(None)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "particles", Indices(np.asarray(self.particles).reshape(-1)))
@@ -112,9 +112,9 @@ class ShapeMatching:
                 f"body's particles, got {self.rest_position.shape}"
             )
 
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, *, alive: Array | None = None) -> Array:
         body, dtype = np.asarray(self.particles), position.dtype
-        here = jnp.ones(len(body), dtype) if self.here is None else self.here.astype(dtype)
+        here = jnp.ones(len(body), dtype) if alive is None else alive[body].astype(dtype)
         here = here[:, None]
 
         def about_mean(x):
@@ -130,9 +130,9 @@ class ShapeMatching:
         force = self.stiffness.astype(dtype) * to_goal + self.damping.astype(dtype) * to_rigid
         return jnp.zeros_like(position).at[body].add(force)
 
-    def among(self, alive: Array) -> ShapeMatching:
+    def prepare(self, context: Any) -> Callable[..., Array]:
         """The body of the living only."""
-        return replace(self, here=alive[np.asarray(self.particles)].astype(self.rest_position.dtype))
+        return self if context.alive is None else functools.partial(self, alive=context.alive)
 
     def check(self, particles: int, dim: int) -> None:
         checks.indices("ShapeMatching.particles", self.particles, particles, "particle indices")

@@ -94,10 +94,14 @@ class Springs:
         store_as_float(self, "ks", "kd", "rest_length")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        return self.prepare(len(position), position.dtype)(t, position, velocity, mass)
+        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
 
-    def prepare(self, particles: int, dtype: Any) -> PreparedSprings:
-        """The same force with its parameters laid out for the kernels, which is the same work at every step."""
+    def prepare(self, context: Any) -> PreparedSprings | None:
+        """The springs between the living, laid out for the kernels; None where there are no springs."""
+        return self.laid_out(context.particles, context.dtype).prepare(context) if len(self.edges) else None
+
+    def laid_out(self, particles: int, dtype: Any) -> PreparedSprings:
+        """The same force with its parameters in the slots of each layout, which is the same work at every step."""
         layouts = self.edges.layouts(particles)
         parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
         slots = ([layout.to_slots(x) for layout in layouts] for x in parameters)
@@ -108,11 +112,6 @@ class Springs:
         ks, rest_length = (self._per_spring(x, position.dtype) for x in (self.ks, self.rest_length))
         r, _ = direction(self.edges.difference(position))
         return jnp.sum(ks * (r - rest_length) ** 2) / 2
-
-    def among(self, alive: Array) -> Springs:
-        """Springs between the living only: a spring with a dead end has no stiffness and no damping."""
-        both = jnp.all(alive[self.edges[:]], axis=1)
-        return replace(self, ks=jnp.where(both, self.ks, 0), kd=jnp.where(both, self.kd, 0))
 
     @staticmethod
     def _per_spring(x: Array, dtype: Any) -> Array:
@@ -144,9 +143,11 @@ class PreparedSprings:
             total = [a + b for a, b in zip(total, shares, strict=True)]
         return stack(total)
 
-    def among(self, alive: Array) -> PreparedSprings:
-        """Between the living only, as `Springs.among`."""
-        both = jnp.all(alive[self.edges[:]], axis=1)
+    def prepare(self, context: Any) -> PreparedSprings:
+        """Between the living only: a spring with a dead end has no stiffness and no damping."""
+        if context.alive is None:
+            return self
+        both = jnp.all(context.alive[self.edges[:]], axis=1)
         here = [layout.to_slots(both) for layout in self.layouts]
 
         def only_here(parameter):

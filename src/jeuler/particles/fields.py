@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from jeuler._core.component import unwrapped
 from jeuler.particles.state import ParticleState, with_default_fields
 
 F = TypeVar("F", bound=Callable)
+
+BEFORE, AFTER, START = ACTS = ("before motion", "after motion", "start and after motion")
+Acts = Literal["before motion", "after motion", "start and after motion"]
 
 
 def uses(
@@ -17,6 +20,7 @@ def uses(
     writes: tuple[str, ...] = (),
     sets: tuple[str, ...] = (),
     before_motion: bool = False,
+    acts: Acts | None = None,
 ) -> Callable[[F], F]:
     """Declare the fields of a force or effect that is a plain function. Position, velocity and mass need no word.
 
@@ -26,9 +30,12 @@ def uses(
       reads: fields that must be there.
       writes: fields that an effect changes for some particles; the state gets them if it has none.
       sets: fields that an effect gives to every particle, each step: nothing else may write them.
-      before_motion: True for births and deaths, which come before the motion of a step.
+      before_motion: True for births and deaths, which come before the motion of a step; as acts="before motion".
+      acts: when an effect acts: "before motion", "after motion", as without a word, or "start and after motion", once
+        before the first step as well.
     Returns: a decorator that gives the function back, with these as its attributes.
-    Raises: ValueError, in `simulate`, if nothing provides a field that is read, or two effects write one in conflict.
+    Raises: ValueError, if acts is none of these; in `simulate`, if nothing provides a field that is read, or two
+      effects write one in conflict.
     Example:
       >>> import jeuler
       >>> @jeuler.uses(reads=("temperature",))
@@ -40,8 +47,12 @@ def uses(
     Source: the idea of declared reads and writes is that of entity component systems.
     """
 
+    if acts not in (None, *ACTS):
+        raise ValueError(f"acts must be one of {', '.join(map(repr, ACTS))}, got {acts!r}")
+
     def decorate(function: F) -> F:
-        values = {"reads": reads, "writes": writes, "sets": sets, "before_motion": before_motion}
+        when = acts or (BEFORE if before_motion else AFTER)
+        values = {"reads": reads, "writes": writes, "sets": sets, "acts": when}
         for name, value in values.items():
             setattr(function, name, value)
         return function
@@ -54,6 +65,11 @@ def declared(part: Any, what: str, default: Any = ()) -> Any:
     return getattr(unwrapped(part), what, default)
 
 
+def acts(effect: Any) -> str:
+    """When in a step an effect acts, one of `ACTS`."""
+    return declared(effect, "acts", BEFORE if declared(effect, "before_motion", False) else AFTER)
+
+
 def name_of(part: Any) -> str:
     part = unwrapped(part)
     return getattr(part, "__name__", type(part).__name__)
@@ -64,7 +80,8 @@ def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: I
     effects = tuple(effects)
     shapes: dict[str, tuple[int, ...]] = {}
     for effect in effects:
-        shapes |= declared(effect, "shapes", {})
+        for fields in (declared(effect, "writes"), declared(effect, "sets")):
+            shapes |= fields if isinstance(fields, dict) else {}
         for field in declared(effect, "sets"):
             for other in effects:
                 if other is not effect and field in (*declared(other, "writes"), *declared(other, "sets")):

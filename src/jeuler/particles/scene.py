@@ -1,4 +1,4 @@
-"""The scene of forces and effects that moves particles, and the run."""
+"""The scene of forces and effects that moves particles."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.component import as_component, component, replace
-from jeuler._core.components import by_component, split, stack
+from jeuler._core.calls import with_previous
+from jeuler._core.component import as_component, component
+from jeuler.particles.equation import Attributes, Equation
 from jeuler.particles.fields import declared, name_of
+from jeuler.particles.protocols import Context
 from jeuler.particles.state import ParticleState
 
 
@@ -24,11 +26,13 @@ class Scene:
 
     Args:
       forces: functions ``(t, position, velocity, mass) -> (particle, dim)`` in N, such as `Springs` and `Gravity`.
-      effects: functions ``(t, dt, state, key) -> state``, applied at each step in this order: births and deaths
-        (`Emitter`, `Lifetime`, ...) before the motion, all others, such as `PrescribedMotion`, after it. One that needs
-        the state before the motion, such as `Collisions`, has a method ``over_step(t, dt, previous, state, key)``,
-        which is called instead.
-    Raises: ValueError, in `simulate`, where a force or effect does not fit the state.
+        The mass is (particle,).
+      effects: functions ``(t, dt, previous, state, key) -> state``, applied at each step in this order: births and
+        deaths (`Emitter`, `Lifetime`, ...) before the motion, all others, such as `PrescribedMotion`, after it.
+        ``previous`` is the state before the motion; functions without it, ``(t, dt, state, key) -> state``, do as well.
+        What else forces and effects may have: `jeuler.particles.protocols`.
+    Raises: ValueError, if a part is no function, or one of other arguments; in `simulate`, where a force or effect does
+      not fit the state.
     Example:
       >>> import jax, jeuler
       >>> scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks=10.0, kd=0.1, rest_length=1.0),))
@@ -50,7 +54,7 @@ class Scene:
                 _check_part(name, part)
             object.__setattr__(self, name, tuple(as_component(part) for part in parts))
 
-    def vector_field(self, t: Any, y: tuple[Array, Array], mass: Any) -> tuple[Array, Array]:
+    def vector_field(self, t: Any, y: tuple[Array, Array], args: Any) -> tuple[Array, Array]:
         """The equation of motion, as `solve` and ``diffrax.ODETerm`` take it.
 
             (position, velocity) -> (velocity, acceleration)
@@ -58,9 +62,10 @@ class Scene:
         Args:
           t: time, s.
           y: the pair (position, velocity), each (particle, dim), m and m/s.
-          mass: () or (particle,), kg; a particle of mass inf does not move. Where forces read further fields of
-            the state, what `Scene.attributes` makes of it.
+          args: the mass, () or (particle,), kg; a particle of mass inf does not move. Or what `Scene.attributes` makes
+            of a state, which holds the further fields that forces read.
         Returns: the pair (velocity, acceleration), m/s and m/s^2.
+        Raises: ValueError, at trace time, if a force reads a field and args is a mass.
         Example:
           >>> import jax.numpy as jnp, jeuler
           >>> scene = jeuler.Scene(forces=(jeuler.Gravity([-9.5]),))
@@ -68,55 +73,18 @@ class Scene:
           >>> velocity.tolist(), acceleration.tolist()
           ([[1.0]], [[-9.5]])
         """
-        position, velocity = y
-        fields = mass if isinstance(mass, dict) else {"mass": mass}
-        mass, alive = jnp.asarray(fields["mass"], dtype=position.dtype), fields.get("alive")
-        velocity = by_component(lambda v: jnp.where(jnp.isinf(mass), 0, v), velocity)
-        position, velocity = self.constrain(t, position, velocity)
-        x, v = split(position), split(velocity)
-        force = [jnp.zeros_like(component) for component in x]
-        for part in self.forces:  # each gets arrays of its own, so that derivatives too are summed by component
-            if alive is not None and hasattr(part, "among"):
-                part = part.among(alive)
-            own = {name: fields[name] for name in declared(part, "reads")}
-            share = split(part(t, stack(x), stack(v), mass, **own))
-            force = [a + b for a, b in zip(force, share, strict=True)]
-        acceleration = [f / mass if alive is None else jnp.where(alive, f / mass, 0) for f in force]
-        slope = stack(v), stack(acceleration)
-        for effect in self.effects:
-            if hasattr(effect, "constrain_slope"):
-                slope = effect.constrain_slope(t, *slope)
-        return slope
+        context = Context(len(y[0]), y[0].dtype)
+        return Equation.of(self.forces, self.effects, context).vector_field(t, y, args)
 
-    def prepare(self, particles: int, dtype: Any) -> Scene:
-        """The same scene with the work done that is the same at every step."""
-        forces = (part.prepare(particles, dtype) if hasattr(part, "prepare") else part for part in self.forces)
-        return replace(self, forces=tuple(forces))
-
-    def attributes(self, state: ParticleState) -> Any:
-        """What `vector_field` takes beside t and y: the mass, and with it only those fields that some force reads.
+    def attributes(self, state: ParticleState) -> Attributes:
+        """What `vector_field` takes as args: the mass, and with it only those fields that some force reads.
 
         A dead slot has infinite mass there: it feels no force.
         """
-        names = {name for part in self.forces for name in declared(part, "reads")}
-        mass = state.mass
-        if state.alive is not None:
-            names.add("alive")
-            mass = jnp.where(state.alive, mass, jnp.inf)
-        return {"mass": mass, **{name: getattr(state, name) for name in sorted(names)}} if names else mass
-
-    def for_step(self, dt: Any) -> Scene:
-        """The scene with drags that never overshoot the air in steps of dt; several share the way to go."""
-        drags = sum(hasattr(part, "for_step") for part in self.forces)
-        forces = (part.for_step(drags * dt) if hasattr(part, "for_step") else part for part in self.forces)
-        return replace(self, forces=tuple(forces)) if drags else self
-
-    def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
-        """Position and velocity at time t with the prescribed ones put in."""
-        for effect in self.effects:
-            if hasattr(effect, "constrain"):
-                position, velocity = effect.constrain(t, position, velocity)
-        return position, velocity
+        names = {name for part in self.forces for name in declared(part, "reads")} - {"mass", "alive"}
+        others = {name: getattr(state, name) for name in sorted(names)}
+        mass = state.mass if state.alive is None else jnp.where(state.alive, state.mass, jnp.inf)
+        return Attributes(mass, state.alive, others or None)
 
     def energy(self, t: Any, y: tuple[Array, Array], mass: Any) -> Array:
         """Kinetic and potential energy of the particles that can move, J; of the forces that have a potential.
@@ -148,3 +116,5 @@ def _check_part(name: str, part: Any) -> None:
         raise ValueError(f"{name_of(part)} is an effect, (t, dt, state, key) -> state; put it in Scene.effects")
     if name == "effects" and {"position", "velocity"} <= arguments:
         raise ValueError(f"{name_of(part)} is a force, (t, position, velocity, mass) -> N; put it in Scene.forces")
+    if name == "effects":
+        with_previous(part, name_of(part))

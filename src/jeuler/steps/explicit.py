@@ -26,7 +26,7 @@ def explicit(order: int) -> Callable[[Callable[..., PyTree]], Any]:
     """Make a step ``y + increment`` from a function that returns the increment.
 
     The step keeps the increment as ``step.increment``, so that ``solve(compensated=True)`` can add it without
-    losing its low bits, and the order of its cumulative error as ``step.order``.
+    losing its low bits, the order of its cumulative error as ``step.order``, and ``step.explicit``, True.
     """
 
     def decorate(increment: Callable[..., PyTree]) -> Any:
@@ -36,9 +36,18 @@ def explicit(order: int) -> Callable[[Callable[..., PyTree]], Any]:
 
         step.increment = increment  # type: ignore[attr-defined]
         step.order = order  # type: ignore[attr-defined]
+        step.explicit = True  # type: ignore[attr-defined]
         return step
 
     return decorate
+
+
+def is_explicit_of_first_order(step: Any) -> bool:
+    """Whether a step says of itself that it is explicit and of order 1: v + dt a(v), so that long ones overshoot.
+
+    A step of the person's own does so with the attributes ``step.explicit = True`` and ``step.order = 1``.
+    """
+    return getattr(step, "explicit", False) is True and getattr(step, "order", None) == 1
 
 
 @explicit(order=1)

@@ -32,6 +32,10 @@ class ExtrapolatedStep:
     def __name__(self) -> str:
         return f"extrapolated {getattr(self.base, '__name__', 'step')} of order {self.order}"
 
+    @property
+    def explicit(self) -> bool:
+        return getattr(self.base, "explicit", False)
+
     def __call__(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
         return trees.add(y, self.increment(f, t, y, dt, args))
 

@@ -1,0 +1,150 @@
+"""The equation of motion of a scene: forces in the form that the loop calls, and what they read."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from jeuler._core.component import component
+from jeuler._core.components import by_component, split, stack
+from jeuler._core.vectors import total
+from jeuler._jax.materialise import stored
+from jeuler.forces.drag import Resistance, inertia
+from jeuler.particles.fields import declared, name_of
+from jeuler.particles.protocols import Context
+from jeuler.steps.explicit import is_explicit_of_first_order
+
+
+@component()
+class Attributes:
+    """What the equation of motion takes beside time, position and velocity.
+
+    Attributes:
+      mass: () or (particle,), kg; inf for a pinned particle and for a dead slot.
+      alive: (particle,), boolean; None where all are.
+      others: the fields that some force reads, by name.
+    """
+
+    mass: Any
+    alive: Any = None
+    others: Any = None
+
+    def field(self, name: str, reader: str) -> Array:
+        """A field that a force reads; ValueError if it is not there."""
+        if name in ("mass", "alive"):
+            return getattr(self, name)
+        if name not in (self.others or {}):
+            raise ValueError(f"{reader} reads {name!r}, got a mass alone; pass args=scene.attributes(state)")
+        return self.others[name]
+
+
+class Prepared(NamedTuple):
+    """A force of a scene in the form that the loop calls."""
+
+    name: str
+    reads: tuple[str, ...]
+    kernel: Callable[..., Array]
+
+
+class Share(NamedTuple):
+    """What one force adds to the sum, by component; ``drag`` if it is one that must not overshoot."""
+
+    name: str
+    force: Sequence[Array]
+    drag: Resistance | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Equation:
+    """dp/dt = v, dv/dt = sum of forces / m, for one number of particles.
+
+    In a run by an explicit first-order step, which overshoots where dt is long against drag, the sum of forces acts on
+    a greater mass, see `jeuler.forces.drag.inertia`.
+    """
+
+    forces: tuple[Prepared, ...]
+    effects: tuple
+    context: Context
+
+    @classmethod
+    def of(cls, forces: Iterable, effects: Iterable, context: Context) -> Equation:
+        prepared = []
+        for k, force in enumerate(forces):
+            kernel = force.prepare(context) if hasattr(force, "prepare") else force
+            if kernel is not None:
+                prepared.append(Prepared(f"forces[{k}] {name_of(force)}", declared(force, "reads"), kernel))
+        prepared.sort(key=lambda force: hasattr(force.kernel, "drag"))  # drags last: so they are summed in every run
+        prescribing = tuple(effect for effect in effects if hasattr(effect, "prescribe"))
+        return cls(tuple(prepared), prescribing, context)
+
+    def vector_field(self, t: Any, y: tuple[Array, Array], args: Any) -> tuple[Array, Array]:
+        """The slope (velocity, acceleration) of (position, velocity), m/s and m/s^2."""
+        attributes, x, v = self.moving(t, y, args)
+        force, mass = self.net_force(t, x, v, attributes)
+        alive = attributes.alive
+        acceleration = [f / mass if alive is None else jnp.where(alive, f / mass, 0) for f in force]
+        slope = stack(v), stack(acceleration)
+        for indices, _, velocity, rate in self.prescribed(t, slope[0].dtype):
+            slope = slope[0].at[indices].set(velocity), slope[1].at[indices].set(rate)
+        return slope
+
+    def moving(self, t: Any, y: tuple[Array, Array], args: Any) -> tuple[Attributes, Any, Any]:
+        """Attributes, position and velocity by component; pinned particles at rest, prescribed ones on their path."""
+        position, velocity = y
+        attributes = args if isinstance(args, Attributes) else Attributes(args)
+        mass = jnp.asarray(attributes.mass, dtype=position.dtype)
+        velocity = by_component(lambda v: jnp.where(jnp.isinf(mass), 0, v), velocity)
+        position, velocity = self.constrain(t, position, velocity)
+        return Attributes(mass, attributes.alive, attributes.others), split(position), split(velocity)
+
+    def prescribed(self, t: Any, dtype: Any) -> Iterator[tuple[Array, Array, Array, Array]]:
+        """Indices, position, velocity and acceleration of what each effect prescribes."""
+        for effect in self.effects:
+            indices, *values = effect.prescribe(t, dtype)
+            yield jnp.asarray(indices, int), *values
+
+    def constrain(self, t: Any, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """Position and velocity at time t with the prescribed ones put in."""
+        for indices, p, v, _ in self.prescribed(t, position.dtype):
+            position, velocity = position.at[indices].set(p), velocity.at[indices].set(v)
+        return position, velocity
+
+    def shares(self, t: Any, x: Any, v: Any, attributes: Attributes) -> Iterator[Share]:
+        """What each force adds to the sum. Each gets arrays of its own: so derivatives too are summed by component."""
+        mass = jnp.broadcast_to(attributes.mass, x[0].shape) if x else attributes.mass
+        context = dataclasses.replace(self.context, alive=attributes.alive)
+        limited = self.context.step is not None and is_explicit_of_first_order(self.context.step)
+        for name, reads, kernel in self.forces:
+            if attributes.alive is not None and hasattr(kernel, "prepare"):
+                kernel = kernel.prepare(context)
+                if kernel is None:
+                    continue
+            if limited and hasattr(kernel, "drag"):
+                drag = kernel.drag(t, stack(x))
+                yield Share(name, drag.force(v), drag)
+            else:
+                fields = {field: attributes.field(field, name) for field in reads}
+                yield Share(name, split(kernel(t, stack(x), stack(v), mass, **fields)), None)
+
+    def net_force(self, t: Any, x: Any, v: Any, attributes: Attributes) -> tuple[list[Array], Array]:
+        """The sum of forces by component, and the mass that it acts on, kg."""
+        shares = list(self.shares(t, x, v, attributes))
+        drags = [share.drag for share in shares if share.drag is not None]
+        if not drags:
+            return add([share.force for share in shares], x), attributes.mass
+        others = add([share.force for share in shares if share.drag is None], x)
+        if any(drag.quadratic is not None for drag in drags):  # of which each component needs the others of all
+            others = [stored(component) for component in others]
+        mass = inertia(attributes.mass, jnp.asarray(self.context.dt), drags, v, others)
+        return add([others, *(share.force for share in shares if share.drag is not None)], x), mass
+
+
+def add(forces: Sequence[Sequence[Array]], like: Sequence[Array]) -> list[Array]:
+    """The sum of forces given by component; zeros where there is none."""
+    if not forces:
+        return [jnp.zeros_like(one) for one in like]
+    return [total(parts) for parts in zip(*forces, strict=True)]

@@ -1,0 +1,116 @@
+"""One step of a scene, part by part: effects, motion, effects, zeros in dead slots. It is composed here alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+from jax import Array
+
+from jeuler._core.calls import with_previous
+from jeuler._core.components import split, stack
+from jeuler.particles.equation import Equation
+from jeuler.particles.fields import BEFORE, acts, name_of
+from jeuler.particles.protocols import Context
+from jeuler.particles.scene import Scene
+from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
+from jeuler.solving._scan import Grid, advance_by
+from jeuler.steps.explicit import Step
+
+
+class Moment:
+    """The state at a point within a step: whole, and in the parts in which it is carried, each made when asked for."""
+
+    def __init__(self, *, state: ParticleState | None = None, parts: tuple[tuple, ParticleState] | None = None) -> None:
+        if state is not None:
+            self.state = state
+        if parts is not None:
+            self.parts = parts
+
+    @functools.cached_property
+    def state(self) -> ParticleState:
+        return join_state(self.parts)
+
+    @functools.cached_property
+    def parts(self) -> tuple[tuple, ParticleState]:
+        return split_state(self.state)
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneStep:
+    """A step of a run of a scene. `simulate` carries its last moment on; `diagnose` looks at each."""
+
+    scene: Scene
+    grid: Grid
+    step: Step
+    key: Array | None
+    equation: Equation
+    compensated: bool = False
+    any_window: bool = False  # the forces are prepared in each step, for as many particles as it has
+
+    @classmethod
+    def of(cls, scene: Scene, state: ParticleState, grid: Grid, step: Step, key: Array | None, **how: Any) -> SceneStep:
+        context = Context(len(state.position), state.position.dtype, grid.dt, step)
+        return cls(scene, grid, step, key, Equation.of(scene.forces, scene.effects, context), **how)
+
+    @functools.cached_property
+    def advance(self) -> Callable:
+        step = self.step if hasattr(self.step, "increment") else on_arrays(self.step)
+        return advance_by(step, compensated=self.compensated)
+
+    def __call__(self, n: Array, t: Array, carried: tuple[Any, Any]) -> tuple[Any, Any]:
+        """What is carried, (state in parts, remainder of its sums), after the step from t, the n-th from 0."""
+        *_, (_, moment, remainder) = self.parts(n, t, carried)
+        return moment.parts, remainder
+
+    def parts(self, n: Array, t: Array, carried: tuple[Any, Any]) -> Iterator[tuple[str, Moment, Any]]:
+        """The name of each part of the step, and the moment after it, in their order."""
+        parts, remainder = carried
+        before = moment = Moment(parts=parts)
+        for name, effect in self.effects(n, early=True):
+            moment = Moment(state=effect(t, self.grid.dt, before.state, moment.state))
+            yield name, moment, remainder
+
+        before, (motion, rest) = moment, moment.parts
+        motion, remainder = self.advance(
+            self.field, t, (motion, remainder), self.grid.dt, self.scene.attributes(moment.state)
+        )
+        moment = Moment(parts=(motion, rest))
+        yield name_of(self.step), moment, remainder
+
+        for name, effect in self.effects(n, early=False):
+            moment = Moment(state=effect(self.grid.clock(n + 1), self.grid.dt, before.state, moment.state))
+            yield name, moment, remainder
+        if self.scene.effects and rest.alive is not None:
+            yield "dead slots", Moment(state=zero_dead_slots(moment.state)), remainder
+
+    def effects(self, n: Array, *, early: bool) -> Iterator[tuple[str, Callable]]:
+        """Name, and ``effect(t, dt, previous, state)`` with the key of step n, of those before the motion, or after."""
+        for k, effect in enumerate(self.scene.effects):
+            if (acts(effect) == BEFORE) == early:
+                key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n), k)
+                yield f"effects[{k}] {name_of(effect)}", functools.partial(with_previous(effect, ""), key=key)
+
+    def field(self, t: Any, motion: tuple, attributes: Any) -> tuple:
+        """The equation of motion by component, as the motion is carried from step to step."""
+        position, velocity = map(stack, motion)
+        equation = self.equation
+        if self.any_window and len(position) != equation.context.particles:
+            context = dataclasses.replace(equation.context, particles=len(position))
+            equation = Equation.of(self.scene.forces, self.scene.effects, context)
+        return tuple(map(split, equation.vector_field(t, (position, velocity), attributes)))
+
+
+def on_arrays(step: Step) -> Step:
+    """A step of somebody's own, which may do arithmetic on (particle, dim) arrays, for the motion by components."""
+
+    def by_components(f, t, motion, dt, attributes):
+        def on_arrays(t, y, attributes):
+            return tuple(map(stack, f(t, tuple(map(split, y)), attributes)))
+
+        return tuple(map(split, step(on_arrays, t, tuple(map(stack, motion)), dt, attributes)))
+
+    return functools.wraps(step)(by_components)
