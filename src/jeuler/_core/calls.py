@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from jeuler._core import checks
+from jeuler._core.component import unwrapped
 
 
 def previous_is_optional(method: Callable) -> Callable:
@@ -31,7 +32,7 @@ def with_previous(effect: Callable, name: str) -> Callable:
     """
     if hasattr(effect, "over_step"):  # what effects of the person's own had for this before `previous`
         return effect.over_step
-    signature = checks.signature_of(effect)
+    signature = checks.signature_of(unwrapped(effect))
     if signature is None or "previous" in signature.parameters or not _takes(signature, 4):
         if signature is not None and not _takes(signature, 5):
             raise ValueError(
