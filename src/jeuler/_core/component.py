@@ -119,7 +119,7 @@ def _is_number(x: Any) -> bool:
 class Function:
     """A plain function in a place where a pytree is expected: all of it is static."""
 
-    function: Callable
+    function: Any
 
     def __call__(self, *args: Any, **fields: Any) -> Any:
         return self.function(*args, **fields)

@@ -11,8 +11,9 @@ from jax import Array
 
 from jeuler._core import checks, trees
 from jeuler._core.calls import with_previous
-from jeuler._core.component import replace
+from jeuler._core.component import Function, replace
 from jeuler._core.components import per_particle
+from jeuler._jax import programs
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import START, acts, declared, name_of, with_required_fields
 from jeuler.particles.protocols import Context
@@ -72,11 +73,28 @@ def simulate(
 
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
-    scene_step, state = begin(
-        scene, state, dt=dt, num_steps=num_steps, t0=t0, step=step, save_every=save_every, key=key,
-        checkpoint=checkpoint, compensated=compensated, any_window=bool(windows),
-    )  # fmt: skip
-    grid = scene_step.grid
+    grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint)
+    inputs = scene, state, grid, key, Function(step), Function(save)
+    settings = checkpoint, compensated, windows if isinstance(windows, str) else tuple(windows)
+    if checkpoint == "reversible":  # looks at values
+        return _simulate(*inputs, *settings)
+    return programs.call(_simulate, inputs, settings)
+
+
+def _simulate(
+    scene: Scene,
+    state: ParticleState,
+    grid: Grid,
+    key: Array | None,
+    stepper: Function,
+    saver: Function,
+    checkpoint: Checkpoint,
+    compensated: bool,
+    windows: tuple[int, ...] | str,
+) -> Solution:
+    """`simulate`, as it is compiled."""
+    step, save = stepper.function, saver.function
+    scene_step, state = first_step(scene, state, grid, step, key, compensated=compensated, any_window=bool(windows))
 
     def saved(t, parts):
         state = join_state(parts)
@@ -86,8 +104,41 @@ def simulate(
         return _reversibly(scene_step, state, saved)
     motion, rest = split_state(state)
     start = (motion, rest), no_remainder(motion, compensated)
-    within = in_windows(windows, scene, state, save_every)
+    within = in_windows(windows, scene, state, grid.save_every)
     return scan_grid(scene_step, start, grid, saved, watch=lambda parts: parts[0], within=within)
+
+
+def check_run(
+    scene: Scene,
+    state: ParticleState,
+    dt: Any,
+    num_steps: int,
+    t0: Any,
+    save_every: int,
+    key: Array | None,
+    checkpoint: Checkpoint = None,
+) -> Grid:
+    """Every check that looks at values, of these arguments of `simulate`: made at each call, traced or not."""
+    checks.kind("scene", scene, Scene)
+    checks.kind("state", state, ParticleState)
+    checks.random_key(key)
+    state.check()
+    scene.check(state)
+    return Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(state.position))
+
+
+def first_step(
+    scene: Scene, state: ParticleState, grid: Grid, step: Step, key: Array | None, **how: bool
+) -> tuple[SceneStep, ParticleState]:
+    """The step and the first state of a run; checked in what does not depend on values."""
+    check_step(step)
+    state = with_required_fields(state, scene.forces, scene.effects)
+    state = _at_start(scene, state, grid, key)
+    motion = checks.state("state", (state.position, state.velocity))
+    form = jax.eval_shape(scene.vector_field, grid.t0, motion, scene.attributes(state))
+    checks.same_form("the sum of forces", motion, form)
+    _check_effects(scene, state, grid, key)
+    return SceneStep.of(scene, state, grid, step, key, **how), state
 
 
 def begin(
@@ -102,23 +153,10 @@ def begin(
     key: Array | None = None,
     checkpoint: Checkpoint = None,
     compensated: bool = False,
-    any_window: bool = False,
 ) -> tuple[SceneStep, ParticleState]:
     """The step and the first state of a run with these arguments, as `simulate` takes them; checked."""
-    checks.kind("scene", scene, Scene)
-    checks.kind("state", state, ParticleState)
-    checks.random_key(key)
-    check_step(step)
-    state.check()
-    state = with_required_fields(state, scene.forces, scene.effects)
-    scene.check(state)
-    grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(state.position))
-    state = _at_start(scene, state, grid, key)
-    motion = checks.state("state", (state.position, state.velocity))
-    form = jax.eval_shape(scene.vector_field, grid.t0, motion, scene.attributes(state))
-    checks.same_form("the sum of forces", motion, form)
-    _check_effects(scene, state, grid, key)
-    return SceneStep.of(scene, state, grid, step, key, compensated=compensated, any_window=any_window), state
+    grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint)
+    return first_step(scene, state, grid, step, key, compensated=compensated)
 
 
 def _reversibly(run: SceneStep, state: ParticleState, saved: Any) -> Solution:

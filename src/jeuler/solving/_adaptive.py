@@ -11,8 +11,9 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
-from jeuler._core.component import component
+from jeuler._core.component import Function, component
 from jeuler._core.partition import arrays_only
+from jeuler._jax import programs
 from jeuler.solving._tables import adaptive_table
 from jeuler.steps.explicit import VectorField
 from jeuler.steps.extrapolated import ExtrapolatedStep, extrapolated_euler
@@ -105,12 +106,30 @@ def solve_adaptive(
     t0 = jnp.asarray(t0, times.dtype)
     if not checks.is_traced(times) and not checks.is_traced(t0) and not np.all(np.diff(times, prepend=t0) > 0):
         raise ValueError(f"t1 must be later than t0={float(t0)} and increase, got {times.tolist()}")
+    if dt0 is not None:
+        checks.positive("dt0", dt0, "s")
     f, args = arrays_only(f, args)
+    inputs = Function(f), y0, args, times, t0, dt0, rtol, atol, Function(step)
+    return programs.call(_solve_adaptive, inputs, (max_steps,))
+
+
+def _solve_adaptive(
+    field: Function,
+    y0: PyTree,
+    args: PyTree,
+    times: Array,
+    t0: Array,
+    dt0: Any,
+    rtol: Any,
+    atol: Any,
+    stepper: Function,
+    max_steps: int,
+) -> AdaptiveSolution:
+    """`solve_adaptive`, as it is compiled."""
+    f, step = field.function, stepper.function
     checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
-    else:
-        checks.positive("dt0", dt0, "s")
 
     def try_step(end, carry):
         t, y, dt, error_sum, accepted, rejected, tried = carry

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -10,11 +9,13 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
-from jeuler._core.component import component
-from jeuler._core.partition import arrays_only
+from jeuler._core.component import Function, component
+from jeuler._core.partition import OfArrays, arrays_only
+from jeuler._jax import programs
 from jeuler._jax.members import recomputed
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
@@ -101,8 +102,31 @@ def solve(
     """
     y0 = checks.state("y0", y0)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0))
-    checks.function("f", f, "(t, y, args) -> dy/dt", "args is there even if f does not need it")
     f, args = arrays_only(f, args)
+    inputs, settings = (Function(f), y0, args, grid, Function(step), Function(save)), (checkpoint, compensated)
+    if checkpoint == "reversible":  # looks at values
+        return _solve(*inputs, *settings)
+    return programs.call(_solve, inputs, settings)
+
+
+def _solve(
+    field: Function,
+    y0: PyTree,
+    args: PyTree,
+    grid: Grid,
+    stepper: Function,
+    saver: Function,
+    checkpoint: Any,
+    compensated: bool,
+) -> Solution:
+    """`solve`, as it is compiled."""
+    f, step, save = field.function, stepper.function, saver.function
+    checks.function(
+        "f",
+        f.function if isinstance(f, OfArrays) else f,
+        "(t, y, args) -> dy/dt",
+        "args is there even if f does not need it",
+    )
     checks.same_form("the vector field f", y0, jax.eval_shape(f, grid.t0, y0, args))
     if checkpoint == "reversible":
         return solve_reversibly(f, y0, args, grid, save, step, compensated)
@@ -135,7 +159,7 @@ def solve_reversibly(
     return scan_grid(lambda n, t, state: state, (y0, None), grid, save, within=within)
 
 
-@dataclasses.dataclass(frozen=True)
+@component(static=("num_steps", "save_every", "segment"))
 class Grid:
     """When a run steps and saves: checked, and in the precision of the state."""
 
@@ -158,7 +182,8 @@ class Grid:
         checks.positive("dt", dt, "s")
         checks.number("t0", t0)
         segment = _segment_length(checkpoint, num_steps)
-        return cls(jnp.asarray(dt).astype(dtype), num_steps, jnp.asarray(t0).astype(dtype), save_every, segment)
+        dt, t0 = (jnp.asarray(x, dtype) if checks.is_traced(x) else np.asarray(x).astype(dtype) for x in (dt, t0))
+        return cls(dt, num_steps, t0, save_every, segment)
 
     def clock(self, n: Array) -> Array:
         """t0 + n dt."""
