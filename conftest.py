@@ -1,8 +1,23 @@
-"""Doctests run in float32, as users do; the tests themselves in float64 (tests/conftest.py)."""
+"""Doctests run in float32, as users do, the tests in float64; a skip must be named in tests/skips.txt; what is fast."""
+
+import pathlib
+import re
 
 import jax
 import pytest
 from _pytest.doctest import DoctestItem
+
+ROOT = pathlib.Path(__file__).resolve().parent
+NAMED_SKIPS = ROOT / "tests" / "skips.txt"
+FAST = (
+    "tests/_core",
+    "tests/contact/test_colliders.py",
+    "tests/fitting/test_trajectory.py",
+    "tests/samplers",
+    "tests/solving/test_scan.py",
+    "tests/steps/test_explicit.py",
+    "tests/test_api.py",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -12,3 +27,47 @@ def precision(request):
             yield
     else:
         yield
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "fast: a subset of all kinds of tests that takes less than two minutes")
+
+
+def pytest_collection_modifyitems(items):
+    """Mark what ``pytest -m fast`` runs."""
+    for item in items:
+        if item.path.is_relative_to(ROOT) and item.path.relative_to(ROOT).as_posix().startswith(FAST):
+            item.add_marker("fast")
+
+
+def unnamed_skips(skipped):
+    """Those skips, (node id, reason), that tests/skips.txt does not name."""
+    lines = [line for line in NAMED_SKIPS.read_text().splitlines() if line and not line.startswith("#")]
+    named = [re.split(r"\s{2,}", line.strip(), maxsplit=1) for line in lines]
+    return [
+        (node, reason)
+        for node, reason in skipped
+        if not any(node.startswith(start) and expected in reason for start, expected in named)
+    ]
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Name the skips that nobody has named, before pytest's closing line; they fail the run (below)."""
+    unnamed = terminalreporter.config.stash.get(UNNAMED, [])
+    for node, reason in unnamed:
+        terminalreporter.write_line(f"SKIPPED without a line in tests/skips.txt: {node}: {reason}", red=True)
+
+
+UNNAMED = pytest.StashKey[list]()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session, exitstatus):
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or hasattr(session.config, "workerinput"):
+        return
+    reports = reporter.stats.get("skipped", [])
+    skipped = [(report.nodeid, str(getattr(report, "longrepr", ("", "", ""))[-1])) for report in reports]
+    session.config.stash[UNNAMED] = unnamed_skips(skipped)
+    if session.config.stash[UNNAMED] and exitstatus == 0:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED

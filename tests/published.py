@@ -1,11 +1,13 @@
-"""Published initial value problems, read from the shared folder's reference/ode_problems.json."""
+"""Published initial value problems: tests/data/ode_problems.json, which names the source of each."""
 
 import json
+import pathlib
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+PROBLEMS = pathlib.Path(__file__).resolve().parent / "data" / "ode_problems.json"
 NAMES = {name: getattr(jnp, name) for name in ("sin", "cos", "exp", "sqrt", "pi", "where", "floor", "sign")}
 NAMES |= {"range": range, "sum": sum, "abs": abs}
 
@@ -20,14 +22,15 @@ class Published(NamedTuple):
     reference: np.ndarray
 
 
-def problems_in(path):
+def problems_in(path=PROBLEMS):
     """{name: `Published`} of a file."""
     with open(path) as file:
         return {problem["name"]: _published(problem) for problem in json.load(file)["problems"]}
 
 
-def published(shared, name):
-    return problems_in(shared / "reference" / "ode_problems.json")[name]
+def published(name):
+    """The problem of this name."""
+    return problems_in()[name]
 
 
 def _published(problem):

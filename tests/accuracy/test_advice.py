@@ -17,8 +17,8 @@ FAST += ["DETEST_stiff_B5", "DETEST_stiff_E2", "LORENZ_111_t10"]
 
 
 @pytest.mark.parametrize("name", FAST)
-def test_achieved_error_is_near_the_target_on_published_problems(shared, name):
-    f, y0, t0, t1, reference = published(shared, name)
+def test_achieved_error_is_near_the_target_on_published_problems(name):
+    f, y0, t0, t1, reference = published(name)
     run = Pilot(f, y0, t0, t1, None, jeuler.euler_step, np.float64, False)
     for target in (1e-1, 1e-3):
         advice = advise_step(f, y0, t0=t0, t1=t1, error=target)
@@ -63,27 +63,27 @@ def test_stability_bounds_the_step_and_is_named():
     assert advice.predicted_error < 0.1
 
 
-def relative_errors(shared, name):
-    f, y0, t0, t1, reference = published(shared, name)
+def relative_errors(name):
+    f, y0, t0, t1, reference = published(name)
     run = Pilot(f, y0, t0, t1, None, jeuler.euler_step, np.float64, False)
     return lambda n: distance(run(n)[-1], reference) / np.linalg.norm(reference)
 
 
 @pytest.mark.parametrize("name", ["DETEST_stiff_B5", "DETEST_stiff_C1", "DETEST_nonstiff_C1"])
-def test_an_answer_does_not_balance_on_the_edge_of_instability(shared, name):
-    f, y0, t0, t1, _ = published(shared, name)
-    error = relative_errors(shared, name)
+def test_an_answer_does_not_balance_on_the_edge_of_instability(name):
+    f, y0, t0, t1, _ = published(name)
+    error = relative_errors(name)
     for target in (1e-1, 1e-2, 1e-3):
         num_steps = advise_step(f, y0, t0=t0, t1=t1, error=target).num_steps
         assert error(num_steps) <= target
         assert error(math.ceil(0.99 * num_steps)) <= 3 * target
 
 
-def test_where_stability_sets_dt_no_larger_dt_meets_the_target_and_holds(shared):
+def test_where_stability_sets_dt_no_larger_dt_meets_the_target_and_holds():
     """By brute force: every number of steps below the advised one."""
     target = 1e-3
-    f, y0, t0, t1, _ = published(shared, "DETEST_stiff_C1")
-    error = relative_errors(shared, "DETEST_stiff_C1")
+    f, y0, t0, t1, _ = published("DETEST_stiff_C1")
+    error = relative_errors("DETEST_stiff_C1")
     advice = advise_step(f, y0, t0=t0, t1=t1, error=target)
     assert "stability, not accuracy, sets dt" in advice.reason
     better = float(advice.reason.split("error is ")[1].split(" times")[0])
@@ -94,8 +94,8 @@ def test_where_stability_sets_dt_no_larger_dt_meets_the_target_and_holds(shared)
     )
 
 
-def test_the_implicit_steps_that_it_names_meet_the_target(shared):
-    f, y0, t0, t1, reference = published(shared, "DETEST_stiff_C1")
+def test_the_implicit_steps_that_it_names_meet_the_target():
+    f, y0, t0, t1, reference = published("DETEST_stiff_C1")
     reason = advise_step(f, y0, t0=t0, t1=t1, error=1e-3).reason
     num_steps = int(reason.split("meets the target with ")[1].split()[0])
     assert num_steps < 100
@@ -165,8 +165,8 @@ def test_it_refuses_below_the_roundoff_floor_of_float32_and_names_what_could():
     assert abs(float(run.y[-1]) * math.e - 1) < 1.3e-6
 
 
-def test_it_refuses_what_it_cannot_look_into(shared):
-    f, y0, t0, t1, _ = published(shared, "MAZZIA_ROBER")
+def test_it_refuses_what_it_cannot_look_into():
+    f, y0, t0, t1, _ = published("MAZZIA_ROBER")
     advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2)
     assert not advice.feasible
     assert "implicit_euler_step" in advice.reason

@@ -48,14 +48,14 @@ def test_built_in_example(folder, capsys):
 @pytest.mark.parametrize(
     ("drag", "squared", "tolerance", "rms"), [(None, 22.9, 0.3, 2.1e-3), ("quadratic", 22.6, 0.2, 1.3e-3)]
 )
-def test_sphere_in_water(shared, folder, drag, squared, tolerance, rms):
-    arguments = ["fit", str(shared / "data" / "sphere_in_water.csv"), "--from", "0.75", "--json", "out.json"]
+def test_sphere_in_water(sphere_in_water, folder, drag, squared, tolerance, rms):
+    arguments = ["fit", str(sphere_in_water), "--from", "0.75", "--json", "out.json"]
     assert main(arguments + (["--drag", drag] if drag else [])) == 0
     report = json.loads((folder / "out.json").read_text())
     assert report["samples"] == 723
     assert abs(report["modes"][0]["natural_frequency"] ** 2 - squared) <= tolerance
     assert report["rms"] <= rms
-    t, x = np.genfromtxt(shared / "data" / "sphere_in_water.csv", delimiter=",", comments="#").T
+    t, x = np.genfromtxt(sphere_in_water, delimiter=",", comments="#").T
     x = x[t >= 0.75]
     np.testing.assert_allclose(report["amplitude"], np.max(np.abs(x - x.mean())), rtol=1e-6)
     np.testing.assert_allclose(report["share_of_amplitude"], report["rms"] / report["amplitude"])

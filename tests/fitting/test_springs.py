@@ -167,8 +167,8 @@ def test_a_start_that_blows_up_is_backed_off_from():
 @pytest.mark.parametrize(
     ("drag", "frequency", "tolerance", "rms"), [(False, 22.9, 0.3, 2.1e-3), (True, 22.6, 0.2, 1.3e-3)]
 )
-def test_sphere_in_water(shared, drag, frequency, tolerance, rms):
-    times, columns = jeuler.read_trajectory(shared / "data" / "sphere_in_water.csv")
+def test_sphere_in_water(sphere_in_water, drag, frequency, tolerance, rms):
+    times, columns = jeuler.read_trajectory(sphere_in_water)
     keep = times >= 0.75
     times, x = times[keep], columns["x_m"][keep]
     assert len(times) == 723

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from records import measured, synthetic_sphere
 
 import jeuler
 
@@ -85,8 +86,22 @@ def test_cannot_read(tmp_path, text, message):
 
 
 @pytest.mark.parametrize("name", ["sphere_in_water", "pendulum_single", "pendulum_double", "silverbox_multisine"])
-def test_reads_the_measured_files_as_numpy_does(shared, name):
-    path = shared / "data" / f"{name}.csv"
+def test_reads_the_measured_files_as_numpy_does(name):
+    assert_read_as_numpy_does(measured(name))
+
+
+def test_reads_synthetic_files_as_numpy_does(tmp_path):
+    assert_read_as_numpy_does(synthetic_sphere(tmp_path))
+    state = np.random.default_rng(3).normal(size=(500, 5)).round(6)
+    state[:, 0] = np.arange(500) / 100
+    path = tmp_path / "pendulum.csv"
+    np.savetxt(
+        path, state, fmt="%.6f", delimiter=",", header="synthetic\ncolumns: t_s,theta1_rad,theta2_rad,omega1,omega2"
+    )
+    assert_read_as_numpy_does(path)
+
+
+def assert_read_as_numpy_does(path):
     times, columns = jeuler.read_trajectory(path)
     table = np.genfromtxt(path, delimiter=",", comments="#")
     np.testing.assert_array_equal(times, table[:, 0])

@@ -188,8 +188,8 @@ STIFF = {  # steps; where explicit Euler overflows at the same number of steps
 
 
 @pytest.mark.parametrize("name", STIFF)
-def test_stiff_problems_run_to_the_end_with_first_order_error(name, shared):
-    f, y0, _, t1, reference = published(shared, name)
+def test_stiff_problems_run_to_the_end_with_first_order_error(name):
+    f, y0, _, t1, reference = published(name)
 
     def end(step, num_steps):
         return jeuler.solve(f, y0, dt=t1 / num_steps, num_steps=num_steps, save_every=num_steps, step=step)
