@@ -12,9 +12,13 @@ from typing import NoReturn  # noqa: E402
 
 EPILOG = """examples:
   python -m jeuler fit                                  a built-in example
+  python -m jeuler look swing.csv                       what is understood of a file, and the command to fit it
   python -m jeuler fit swing.csv --mass 0.25            one particle on a spring to a fixed point
   python -m jeuler fit drop.csv --from 0.75 --drag quadratic
   python -m jeuler fit two.csv --mass 0.2,0.3 --edges 1-anchor,1-2"""
+
+
+OBSERVED = ("position", "angle", "acceleration", "velocity", "angular velocity")
 
 
 class Parser(argparse.ArgumentParser):
@@ -26,7 +30,7 @@ class Parser(argparse.ArgumentParser):
 
 def parser() -> Parser:
     top = Parser(prog="jeuler", description="Springs, particles and ODEs in JAX.")
-    jobs = top.add_subparsers(dest="job", required=True, metavar="{fit}", parser_class=Parser)
+    jobs = top.add_subparsers(dest="job", required=True, metavar="{fit,look}", parser_class=Parser)
     fit = jobs.add_parser(
         "fit",
         help="recover stiffness ks and damping kd of a measured oscillation",
@@ -34,21 +38,49 @@ def parser() -> Parser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    fit.add_argument(
+        "files", nargs="*", metavar="FILE", help="a recording as it was exported; several: one spring, different masses"
+    )
+    _add_reading(fit)
+    _add_model(fit)
     add = fit.add_argument
-    add("file", nargs="?", metavar="FILE", help="CSV or TSV: a time column in s, then positions in m, x1 y1 x2 y2 ...")
-    add("--mass", default="1", help="mass of the particles in kg, one number or one each: 0.2,0.3 (default 1)")
-    add("--dt", type=float, help="step size of the simulation in s (default: a 40th of a period)")
-    add("--edges", help="springs: 1-2 between particles 1 and 2, 1-anchor to a fixed point (default: an anchor each)")
-    add("--start", help="where the search starts: ks=20,kd=0.3 (default: read off the spectrum and the decay)")
-    add("--drag", choices=["quadratic"], help="add a drag force -c |v| v and fit c as well")
-    add("--columns", help="position columns to use, by name: x1,y1,x2,y2 (default: all that are named so, or all)")
+    add("--plot", metavar="OUT.png", help="where the picture goes (default jeuler_fit.png); - is standard output")
+    add("--json", metavar="OUT.json", help="write the result as JSON too; - is standard output")
+    add("--max-iterations", type=int, default=200, help="the most iterations of each stage of the fit (default 200)")
+    look = jobs.add_parser(
+        "look",
+        help="say what is understood of a recording, and the fit command that it suggests",
+        description="Say what is understood of a recording, and the fit command that it suggests.",
+    )
+    look.add_argument("file", metavar="FILE", help="a recording as it was exported")
+    _add_reading(look)
+    return top
+
+
+def _add_reading(job: argparse.ArgumentParser) -> None:
+    """Options that correct how a recording is understood."""
+    add = job.add_argument
+    add("--columns", help="columns to use, by name: x1,y1,x2,y2 (default: by quantity, said in the result)")
+    add("--observe", choices=OBSERVED, help="the quantity to use (default: position before angle before acceleration)")
     add("--dim", type=int, help="coordinates a particle, where the names do not tell")
+    add("--time", metavar="NAME", help="the time column (default: the one that is named so)")
+    add("--run", metavar="N", help="which run, or all in one fit (default: the one with the most rows)")
+    add("--unit", metavar="x=mm,t=ms", help="units of columns, where their names do not tell or are wrong")
+    add("--skip", type=int, metavar="N", help="leave out the first lines of the file")
     add("--from", dest="begin", type=float, metavar="T", help="leave out what was measured before this time, s")
     add("--to", dest="end", type=float, metavar="T", help="leave out what was measured after this time, s")
-    add("--plot", metavar="OUT.png", help="where the picture goes (default jeuler_fit.png)")
-    add("--json", metavar="OUT.json", help="write the result as JSON too")
-    add("--max-iterations", type=int, default=200, help="the most iterations of each stage of the fit (default 200)")
-    return top
+
+
+def _add_model(job: argparse.ArgumentParser) -> None:
+    """Options that say what is fitted."""
+    add = job.add_argument
+    add("--mass", help="mass of the particles in kg, one number or one each: 0.2,0.3; ? to be found (default 1)")
+    add("--dt", type=float, help="step size of the simulation in s (default: a 40th of a period)")
+    add("--edges", help="springs: 1-2 between particles 1 and 2, 1-anchor to a fixed point (default: an anchor each)")
+    add("--start", help="where the search starts: ks=20,kd=0.3 (default: read off the data)")
+    add("--friction", help="viscous, quadratic, dry, several joined by +, or compare (default viscous)")
+    add("--drag", choices=["quadratic"], help="the same as --friction viscous+quadratic")
+    add("--pendulum", action="store_true", help="a pendulum at any angle instead of a linear spring")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -58,11 +90,15 @@ def main(argv: list[str] | None = None) -> int:
 
     jax.config.update("jax_enable_x64", True)
     from jeuler.commands.fit_file import fit_file
+    from jeuler.commands.look_file import look_file
 
     try:
-        fit_file(arguments, STARTED if argv is None else time.perf_counter())
+        if arguments.job == "look":
+            look_file(arguments)
+        else:
+            fit_file(arguments, STARTED if argv is None else time.perf_counter())
     except (ValueError, OSError) as error:
-        print(f"jeuler fit: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"jeuler {arguments.job}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     return 0
 

@@ -99,7 +99,7 @@ def test_two_coupled_particles(folder, capsys):
         (["fit", "good.csv", "--from", "100"], "0 rows between --from and --to.* the times run from 0 to"),
         (["fit", "good.csv", "--columns", "y"], "no column 'y', the columns are x"),
         (["fit", "good.csv", "--dim", "2"], "do not make particles of 2 coordinates"),
-        (["fit", "good.csv", "--dt", "-1"], "dt must be greater than 0"),
+        (["fit", "good.csv", "--dt", "-1"], "--dt must be a positive finite number, got -1"),
         (["fit", "good.csv", "--drag", "cubic"], "invalid choice"),
         (["fit", "good.csv", "--dt", "fast"], "argument --dt: invalid float value: 'fast'"),
         (["fly"], "invalid choice"),

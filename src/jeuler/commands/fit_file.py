@@ -3,219 +3,201 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
+import sys
+import tempfile
 import time
 from typing import Any
 
-import jax
 import numpy as np
 
-from jeuler._core.component import replace
-from jeuler._core.files import write_atomically
+from jeuler._core.files import check_output, write_atomically
 from jeuler.commands import options
-from jeuler.commands.options import EXAMPLE, Measurement
-from jeuler.fitting import SpringFit, fit_springs
-from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes
-from jeuler.forces import QuadraticDrag, Springs
-from jeuler.particles._simulate import simulate
-from jeuler.particles.scene import Scene
-from jeuler.particles.state import ParticleState
-from jeuler.steps.explicit import rk4_step
+from jeuler.commands.cautions import cautions
+from jeuler.commands.estimate import Estimate, estimate, guess_of, step_size
+from jeuler.commands.model import Model
+from jeuler.commands.picture import draw
+from jeuler.commands.report import lines, report
+from jeuler.commands.selection import Measurement, recordings_in, select, together
+from jeuler.fitting.oscillation import Oscillation
 
 DEFAULT_PICTURE = "jeuler_fit.png"
+PICTURES = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".eps", ".ps")
+STANDARD_OUTPUT = "-"
 
 
 def fit_file(arguments: argparse.Namespace, started: float) -> None:
     """Read, fit, print, draw."""
-    measured = options.example() if arguments.file is None else options.read(arguments)
-    particles, dim = measured.positions.shape[1:]
-    mass = options.masses(arguments.mass, particles) if arguments.file else np.array([EXAMPLE["mass"]])
-    pairs, anchored = options.edges(arguments.edges, particles)
-    guess = estimate_oscillation(measured.times, measured.positions.reshape(len(measured.times), -1))
-    start = options.start(arguments.start)
-    scene, state, parameters = _build(measured, mass, pairs, anchored, guess, start, arguments.drag)
-    dt = arguments.dt or min(2 * np.pi / guess.angular_frequency / 40, np.ptp(measured.times) / 100)
-    hidden = np.full((len(measured.times), len(anchored), dim), np.nan)
-    targets = np.concatenate([measured.positions, hidden], axis=1)
-    found = fit_springs(
-        scene,
-        state,
-        measured.times,
-        targets,
-        dt=dt,
-        t0=measured.times[0],
-        parameters=parameters,
-        max_iterations=arguments.max_iterations,
+    picture = DEFAULT_PICTURE if arguments.plot is None else arguments.plot
+    _check_outputs(arguments.files, picture, arguments.json)
+    for option in ("begin", "end"):
+        options.check_number({"begin": "--from", "end": "--to"}[option], getattr(arguments, option))
+    options.check_number("--dt", arguments.dt, positive=True)
+    if arguments.max_iterations < 1:
+        raise ValueError(f"--max-iterations must be 1 or more, got {arguments.max_iterations}")
+    measured = _measured(arguments)
+    guess = guess_of(measured)
+    mass = options.masses(
+        arguments.mass if arguments.files else str(options.EXAMPLE["mass"]), measured.positions.shape[1]
     )
-    report = _report(measured, found, mass, pairs, anchored, dt)
-    picture = arguments.plot or DEFAULT_PICTURE
-    _draw(measured, found, picture, dt, report)
-    report["seconds"] = time.perf_counter() - started
-    if arguments.json:
-        text = json.dumps(report, indent=2)
-        write_atomically(arguments.json, lambda path: _write_text(path, text))
-    _print(report, picture, example=arguments.file is None)
+    model = _model(arguments, measured, mass, guess)
+    dt = step_size(measured, guess, arguments.dt)
+    found, compared = _fit(arguments, model, measured, guess, dt)
+    warnings = cautions(measured, found, guess, arguments.mass is not None or not arguments.files)
+    told = report(measured, found, warnings)
+    if compared:
+        told["comparison"] = compared
+    _write_outputs(arguments, measured, found, picture, told, started)
+
+
+def _measured(arguments: argparse.Namespace) -> Measurement:
+    """The built-in example, one recording, or several of one spring."""
+    if not arguments.files:
+        return options.example()
+    if len({os.path.realpath(file) for file in arguments.files}) < len(arguments.files):
+        raise ValueError(
+            f"each recording must be given once, got {' '.join(arguments.files)}; --run all takes all runs"
+        )
+    chosen = [select(recordings_in(_input(file), arguments), arguments) for file in arguments.files]
+    return chosen[0] if len(chosen) == 1 else together(chosen)
+
+
+def _input(file: str) -> Any:
+    return sys.stdin.buffer if file == STANDARD_OUTPUT else file
+
+
+def _model(arguments: argparse.Namespace, measured: Measurement, mass: np.ndarray, guess: Oscillation) -> Model:
+    """What the options ask for."""
+    particles, dim = measured.positions.shape[1:]
+    missing = ~np.isfinite(measured.positions).any(axis=(0, 2))
+    if missing.any():
+        raise ValueError(f"{measured.source}: a particle without any position; leave it out with --columns")
+    pairs, anchored = options.edges(arguments.edges, particles)
+    loose = set(range(particles)) - set(anchored) - {k for pair in pairs for k in pair}
+    if loose:
+        raise ValueError(f"--edges joins no spring to particle {min(loose) + 1}; leave it out with --columns")
+    friction = options.frictions(None if arguments.friction == "compare" else arguments.friction)
+    if arguments.drag and "quadratic" not in friction:
+        friction = (*friction, "quadratic")
+    shared = measured.recordings > 1
+    if (shared or arguments.pendulum) and arguments.edges is not None:
+        raise ValueError("--edges has no meaning with --pendulum or several recordings of one spring")
+    if arguments.pendulum and (dim > 1 or (particles > 1 and not shared)):
+        raise ValueError(
+            f"--pendulum fits one angle, got {particles} particles of {dim} coordinates; choose with --columns"
+        )
+    speed = float(np.nanstd(measured.positions)) * guess.angular_frequency * np.sqrt(2)
+    speed = {"acceleration": speed / guess.angular_frequency**2}.get(
+        measured.quantity, speed / guess.angular_frequency if "velocity" in measured.quantity else speed
+    )
+    return Model(
+        mass=mass,
+        pairs=tuple(pairs),
+        anchored=tuple(anchored),
+        dim=dim,
+        friction=friction,
+        observe=measured.quantity,
+        pendulum=arguments.pendulum,
+        shared=shared,
+        spring_mass=shared and len(set(mass.tolist())) > 1,
+        slow=0.02 * speed,
+    )
+
+
+def _fit(
+    arguments: argparse.Namespace, model: Model, measured: Measurement, guess: Oscillation, dt: float
+) -> tuple[Estimate, list[dict[str, Any]]]:
+    """The fit, or with ``--friction compare`` the best of the frictions by the Bayesian information criterion."""
+    asked = options.start(arguments.start)
+    if arguments.friction != "compare":
+        return estimate(model, measured, guess, dt, asked, arguments.max_iterations), []
+    kinds = [("viscous",), ("quadratic",), ("dry",), ("viscous", "dry"), ("viscous", "quadratic")]
+    tried = [
+        estimate(dataclasses.replace(model, friction=kind), measured, guess, dt, asked, arguments.max_iterations)
+        for kind in kinds
+    ]
+    samples = int(np.isfinite(measured.positions).sum())
+    scores = []
+    for found in tried:
+        size = sum(np.size(x) for x in found.params.values())
+        independent = samples / min(t.widening for t in tried) ** 2
+        scores.append(independent * np.log(max(found.loss, 1e-300)) + size * np.log(independent))
+    best = int(np.argmin(scores))
+    compared = [
+        {"friction": "+".join(kind), "rms": float(np.sqrt(found.loss)), "score": float(score - scores[best])}
+        for kind, found, score in zip(kinds, tried, scores, strict=True)
+    ]
+    return tried[best], compared
+
+
+def _check_outputs(files: list[str], picture: str, text: str | None) -> None:
+    """Refuse before the work what would be refused after it, or would destroy what was measured."""
+    outputs = {"--plot": picture} | ({"--json": text} if text is not None else {})
+    for option, path in outputs.items():
+        if path == STANDARD_OUTPUT:
+            continue
+        try:
+            check_output(path)
+        except ValueError as error:
+            raise ValueError(f"{option} {error}") from None
+        for file in files:
+            if os.path.exists(file) and os.path.realpath(file) == os.path.realpath(path):
+                raise ValueError(f"{option} {path}: is the measured file itself; give another name")
+    if text is not None and os.path.realpath(picture) == os.path.realpath(text) and not _is_stream(text):
+        raise ValueError(f"--plot and --json must be different files, got {picture} for both")
+    ending = os.path.splitext(os.path.realpath(picture))[1].lower()
+    if picture != STANDARD_OUTPUT and not _is_stream(picture) and ending not in PICTURES:
+        raise ValueError(
+            f"--plot {picture}: a picture's name must end in {', '.join(PICTURES[:4])}, got {ending or 'none'!r}"
+        )
+
+
+def _is_stream(path: str) -> bool:
+    return os.path.exists(path) and not os.path.isfile(path)
+
+
+def _write_outputs(
+    arguments: argparse.Namespace,
+    measured: Measurement,
+    found: Estimate,
+    picture: str,
+    told: dict[str, Any],
+    started: float,
+) -> None:
+    """Picture, JSON and text; what goes to standard output goes there alone, the text to standard error then."""
+    if picture == STANDARD_OUTPUT:
+        with tempfile.TemporaryDirectory() as folder:
+            path = os.path.join(folder, "fit.png")
+            draw(measured, found, path, told)
+            with open(path, "rb") as file:
+                sys.stdout.buffer.write(file.read())
+    else:
+        draw(measured, found, picture, told)
+    told["seconds"] = time.perf_counter() - started
+    if arguments.json is not None:
+        text = json.dumps(told, indent=2) + "\n"
+        if arguments.json == STANDARD_OUTPUT:
+            sys.stdout.write(text)
+        else:
+            write_atomically(arguments.json, lambda path: _write_text(path, text))
+    piped = STANDARD_OUTPUT in (picture, arguments.json)
+    where = None if picture == STANDARD_OUTPUT else picture
+    printed = lines(told, where, example=not arguments.files)
+    print("\n".join(printed + _compared(told)), file=sys.stderr if piped else sys.stdout)
+
+
+def _compared(told: dict[str, Any]) -> list[str]:
+    rows = sorted(told.get("comparison", []), key=lambda row: row["score"])
+    return [
+        f"  {'friction ' + row['friction']:<28} residual RMS {row['rms']:.4g} {told['unit']}, "
+        + ("the best" if k == 0 else f"worse by {row['score']:.3g}")
+        + (" (over 10: clearly)" if row["score"] > 10 else "")
+        for k, row in enumerate(rows)
+    ]
 
 
 def _write_text(path: str, text: str) -> None:
     with open(path, "w", encoding="utf-8") as file:
-        file.write(text + "\n")
-
-
-def _build(
-    measured: Measurement,
-    mass: np.ndarray,
-    pairs: list[tuple[int, int]],
-    anchored: list[int],
-    guess: Oscillation,
-    start: dict[str, float],
-    drag: str | None,
-) -> tuple[Scene, ParticleState, tuple[str, ...]]:
-    """The scene as the search starts with it, and what is free in it."""
-    particles, dim = measured.positions.shape[1:]
-    if not np.isfinite(measured.positions).any(axis=(0, 2)).all():
-        raise ValueError(f"{measured.source}: a particle without any position; leave it out with --columns")
-    rest = np.nanmean(measured.positions, axis=0)
-    position = np.stack([_first_seen(measured.positions[:, k], rest[k]) for k in range(particles)])
-    ks = start.get("ks", float(np.mean(mass)) * guess.angular_frequency**2)
-    kd = start.get("kd", 2 * float(np.mean(mass)) * guess.decay_rate)
-    forces: list[Any] = []
-    names = []
-    if anchored:
-        edges = [(k, particles + index) for index, k in enumerate(anchored)]
-        forces.append(Springs(edges, np.full(len(edges), ks), np.full(len(edges), kd), 0.0))
-        names += ["anchors"]
-    if pairs:
-        i, j = np.array(pairs).T
-        lengths = np.nanmean(np.linalg.norm(measured.positions[:, i] - measured.positions[:, j], axis=-1), axis=0)
-        names.append(f"forces[{len(forces)}].rest_length")
-        forces.append(Springs(pairs, np.full(len(pairs), ks), np.full(len(pairs), kd), lengths))
-    if drag:
-        amplitude = np.nanstd(measured.positions)
-        forces.append(QuadraticDrag(0.1 * kd / (amplitude * guess.angular_frequency)))
-        names.append("coefficient")
-    state = ParticleState(
-        np.concatenate([position, rest[anchored]]),
-        np.zeros((particles + len(anchored), dim)),
-        np.concatenate([mass, np.full(len(anchored), np.inf)]),
-    )
-    return Scene(forces=tuple(forces)), state, ("ks", "kd", "position", "velocity", *names)
-
-
-def _first_seen(track: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    seen = np.isfinite(track).all(axis=1)
-    return track[np.argmax(seen)] if seen.any() else otherwise
-
-
-def _report(
-    measured: Measurement,
-    found: SpringFit,
-    mass: np.ndarray,
-    pairs: list[tuple[int, int]],
-    anchored: list[int],
-    dt: float,
-) -> dict[str, Any]:
-    """Everything that is printed and written, as plain numbers."""
-    labels = [f"{k + 1}-anchor" for k in anchored] + [f"{i + 1}-{j + 1}" for i, j in pairs]
-    flat = {name: np.concatenate([np.ravel(x) for x in _parts(found.params[name])]) for name in ("ks", "kd")}
-    errors = {name: np.concatenate([np.ravel(x) for x in _parts(found.stderr[name])]) for name in ("ks", "kd")}
-    springs = [
-        {
-            "edge": label,
-            "ks": float(flat["ks"][k]),
-            "ks_stderr": _plain(errors["ks"][k]),
-            "kd": float(flat["kd"][k]),
-            "kd_stderr": _plain(errors["kd"][k]),
-        }
-        for k, label in enumerate(labels)
-    ]
-    rms = float(np.sqrt(found.loss))
-    away = measured.positions - np.nanmean(measured.positions, axis=0)
-    amplitude = float(np.nanmax(np.linalg.norm(away, axis=-1)))
-    report: dict[str, Any] = {
-        "source": measured.source,
-        "samples": int(np.isfinite(measured.positions).sum()),
-        "mass": mass.tolist(),
-        "springs": springs,
-        "modes": [{"natural_frequency": m.angular_frequency, "damping_ratio": m.damping_ratio} for m in _modes(found)],
-        "rms": rms,
-        "amplitude": amplitude,
-        "share_of_amplitude": rms / amplitude if amplitude else 0.0,
-        "dt": float(dt),
-        "iterations": len(found.history),
-        "converged": bool(found.converged),
-        "message": found.message,
-    }
-    if "anchors" in found.params:
-        report["rest_position"] = np.asarray(found.params["anchors"]).tolist()
-    if "coefficient" in found.params:
-        report["drag_coefficient"] = float(found.params["coefficient"])
-        report["drag_coefficient_stderr"] = _plain(found.stderr["coefficient"])
-    return report
-
-
-def _modes(found: SpringFit) -> list[Mode]:
-    """Modes at the mean of the fitted motion."""
-    unmoved = np.nan_to_num(np.asarray(found.predicted)).mean(axis=0)
-    return modes(found.scene, replace(found.state, position=found.state.position * 0 + unmoved))
-
-
-def _parts(x: Any) -> tuple:
-    return x if isinstance(x, tuple) else (x,)
-
-
-def _plain(x: Any) -> float | None:
-    """A number that JSON can hold."""
-    return float(x) if np.isfinite(x) else None
-
-
-def _draw(measured: Measurement, found: SpringFit, picture: str, dt: float, report: dict[str, Any]) -> None:
-    import matplotlib.pyplot as plt
-
-    from jeuler.plotting import plot_fit
-
-    particles = measured.positions.shape[1]
-    t0, count = measured.times[0], len(measured.times)
-    steps = int(np.ceil((measured.times[-1] - t0) / dt))
-    run = jax.jit(lambda: simulate(found.scene, found.state, dt=dt, num_steps=steps, t0=t0, step=rk4_step))()
-    spring = report["springs"][0]
-    source = os.path.basename(measured.source)
-    title = f"{source}: ks = {spring['ks']:.4g} N/m, kd = {spring['kd']:.3g} N s/m"
-    if len(report["springs"]) > 1:
-        title = f"{source}: {len(report['springs'])} springs fitted"
-    figure = plot_fit(
-        measured.times,
-        measured.positions.reshape(count, -1),
-        np.asarray(found.predicted)[:, :particles].reshape(count, -1),
-        names=tuple(measured.names),
-        curve=(run.t, np.asarray(run.y.position)[:, :particles].reshape(steps + 1, -1)),
-        title=title,
-    )
-    write_atomically(picture, lambda path: figure.savefig(path, dpi=130, format=picture.rpartition(".")[2]))
-    plt.close(figure)
-
-
-def _print(report: dict[str, Any], picture: str, example: bool) -> None:
-    def line(name: str, value: Any, error: Any, unit: str, note: str = "") -> None:
-        spread = f" ± {error:.2g}" if error is not None else " (not determined by the data)"
-        print(f"  {name:<24} {value:.5g}{spread} {unit}{note}")
-
-    print(f"{report['source']}: {report['samples']} samples, mass {', '.join(f'{m:g}' for m in report['mass'])} kg")
-    for spring in report["springs"]:
-        where = "" if len(report["springs"]) == 1 else f" of {spring['edge']}"
-        for name, unit in (("ks", "N/m"), ("kd", "N s/m")):
-            note = f"   (true {EXAMPLE[name]:g})" if example else ""
-            line(name + where, spring[name], spring[name + "_stderr"], unit, note)
-    if "drag_coefficient" in report:
-        line("drag coefficient", report["drag_coefficient"], report["drag_coefficient_stderr"], "kg/m")
-    for mode in report["modes"]:
-        omega = mode["natural_frequency"]
-        hertz, squared = omega / (2 * np.pi), omega**2
-        print(f"  {'natural frequency':<24} {omega:.5g} rad/s = {hertz:.4g} Hz (squared {squared:.4g} 1/s^2)")
-        print(f"  {'damping ratio':<24} {mode['damping_ratio']:.4g}")
-    share = f"{100 * report['share_of_amplitude']:.2g} % of the amplitude {report['amplitude']:.3g} m"
-    print(f"  {'residual RMS':<24} {report['rms']:.3g} m, {share}")
-    print(f"  {'fit':<24} {report['message']}, {report['iterations']} iterations")
-    print(f"  {'time':<24} {report['seconds']:.1f} s in all")
-    print(f"  {'picture':<24} {picture}")
+        file.write(text)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jeuler.fitting.spectrum import power_spectrum, refined_line, seen_samples
+from jeuler.fitting.spectrum import periodogram, power_spectrum, refined_line, seen_samples
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
@@ -43,12 +43,10 @@ def estimate_oscillation(times: np.ndarray, values: np.ndarray) -> Oscillation:
 
 def _strongest_line(times: np.ndarray, columns: list[np.ndarray], span: float) -> float:
     if len(times) <= EXACT_ROWS:
-        from scipy.signal import lombscargle
-
         samples = [seen_samples(times, column) for column in columns]
         cycles = np.arange(0.4, max(max(len(t) for t, _ in samples) / 2, 2), 0.1)
         frequencies = 2 * np.pi / span * cycles
-        return float(frequencies[np.argmax(sum(lombscargle(*sample, frequencies) for sample in samples))])
+        return float(frequencies[np.argmax(sum(periodogram(*sample, frequencies) for sample in samples))])
     frequencies, power = power_spectrum(times, columns[0], span)
     for column in columns[1:]:
         power = power + np.interp(frequencies, *power_spectrum(times, column, span), right=0.0)
@@ -89,7 +87,11 @@ def modes(scene: Scene, state: ParticleState) -> list[Mode]:
     at = state.position[free], state.velocity[free] * 0
     (xx, xv), (vx, vv) = jax.jit(jax.jacfwd(slope))(at)
     n = at[0].size
-    matrix = np.block([[np.reshape(b, (n, n)) for b in row] for row in ((xx, xv), (vx, vv))])
+    return modes_of(np.block([[np.reshape(b, (n, n)) for b in row] for row in ((xx, xv), (vx, vv))]))
+
+
+def modes_of(matrix: np.ndarray) -> list[Mode]:
+    """The modes of the linear equation of motion y' = matrix y, y = (position, velocity), slowest first."""
     eigenvalues = np.linalg.eigvals(matrix)
     tiny = 1e-6 * np.abs(eigenvalues).max(initial=0)
     swinging = [s for s in eigenvalues if s.imag > tiny]

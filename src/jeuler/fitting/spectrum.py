@@ -39,6 +39,23 @@ def power_spectrum(times: np.ndarray, column: np.ndarray, span: float) -> tuple[
     return frequencies[keep], power[keep]
 
 
+def periodogram(t: np.ndarray, x: np.ndarray, frequencies: np.ndarray) -> np.ndarray:
+    """The Lomb-Scargle periodogram: what a sine of each frequency takes of the sum of squares, for uneven sampling.
+
+        P = ((x . c)^2 / (c . c) + (x . s)^2 / (s . s)) / 2,  c = cos(w (t - tau)), s = sin(w (t - tau)), c . s = 0
+
+    Source: J. D. Scargle, Astrophysical Journal 263, 835, 1982, equation 10.
+    """
+    phase = frequencies[:, None] * (t - t[0])
+    shift = np.arctan2(np.sin(2 * phase).sum(axis=1), np.cos(2 * phase).sum(axis=1))[:, None] / 2
+    cosine, sine = np.cos(phase - shift), np.sin(phase - shift)
+    tiny = 1e-12 * len(t)
+    return (
+        (cosine @ x) ** 2 / np.maximum((cosine**2).sum(axis=1), tiny)
+        + (sine @ x) ** 2 / np.maximum((sine**2).sum(axis=1), tiny)
+    ) / 2
+
+
 def refined_line(times: np.ndarray, columns: list[np.ndarray], omega: float, span: float) -> float:
     """The frequency near omega at which sines take most of the columns, by least squares at 64 frequencies."""
     width = 2 * np.pi / span

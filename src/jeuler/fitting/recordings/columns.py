@@ -52,7 +52,7 @@ def describe(table: Table, units: dict[str, str]) -> list[Column]:
             raise ValueError(
                 f"--unit: the unit {unit!r} of {name!r} is not known; known are s, ms, m, mm, m/s^2, rad, ..."
             )
-        quantity, factor = _quantity(by_name, by_unit, unit)
+        quantity, factor = _quantity("" if name in units else by_name, by_unit, unit)
         if quantity == "index" and not _counts(table.values[:, k]):
             quantity = ""
         if name.lower() in ("millis", "micros", "ms", "us") and not unit:

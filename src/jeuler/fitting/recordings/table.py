@@ -41,7 +41,7 @@ def named(given: list[str], first: str = "") -> list[str]:
     names: list[str] = []
     taken: set[str] = set()
     for k, name in enumerate(given):
-        name = name or (first if k == 0 and first else f"column{k + 1}")
+        name = "".join(c for c in name if c.isprintable()) or (first if k == 0 and first else f"column{k + 1}")
         while name in taken:
             name = f"{name}_{k + 1}"
         taken.add(name)

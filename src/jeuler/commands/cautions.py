@@ -1,0 +1,133 @@
+"""What may be wrong with a fit, as sentences with what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jeuler.commands.estimate import Estimate
+from jeuler.commands.selection import Measurement
+from jeuler.fitting.oscillation import Oscillation
+from jeuler.fitting.recordings.table import listed
+from jeuler.fitting.spectrum import strong_lines
+
+LARGE_RESIDUAL = 0.02  # of the spread of the data
+LARGE_ANGLE = 0.35  # rad: the period of a pendulum is 0.8 % longer there
+
+
+def cautions(measured: Measurement, found: Estimate, guess: Oscillation, mass_given: bool) -> list[str]:
+    """All sentences that apply."""
+    told = [*measured.warnings]
+    if not mass_given:
+        told.append(
+            "No --mass was given: 1 kg is assumed for each particle. ks and kd are per kilogram then; give --mass."
+        )
+    told += _sampling_words(measured, guess)
+    told += _motion_words(measured, found, guess)
+    told += _residual_words(measured, found, guess)
+    told += _parameter_words(found)
+    return told
+
+
+def _sampling_words(measured: Measurement, guess: Oscillation) -> Iterator[str]:
+    period = 2 * np.pi / guess.angular_frequency
+    span = float(np.ptp(measured.times))
+    if span < 2 * period:
+        yield f"The record holds {span / period:.1f} periods: ks and kd lean on the model; record 5 periods or more."
+    step = measured.sampling.step if measured.sampling else 0.0
+    repeated = measured.sampling.repeated if measured.sampling else 0
+    if repeated:
+        yield (
+            f"{repeated} rows repeat the time of the row before: a clock too coarse or doubled rows; export more "
+            f"decimals of the time."
+        )
+    if step > period / 4:
+        yield (
+            f"There are {period / step:.1f} samples a period: a faster motion would look the same (aliasing); "
+            f"record at {4 / period:.3g} Hz or more, or make sure of the frequency otherwise."
+        )
+
+
+def _motion_words(measured: Measurement, found: Estimate, guess: Oscillation) -> Iterator[str]:
+    model, period = found.model, 2 * np.pi / guess.angular_frequency
+    flat = measured.positions.reshape(len(measured.times), -1)
+    if measured.quantity == "angle" and not model.pendulum:
+        swing = float(np.nanmax(np.abs(flat - np.nanmean(flat, axis=0))))
+        if swing > LARGE_ANGLE:
+            yield (
+                f"The angle reaches {np.degrees(swing):.0f} degrees: a pendulum is no linear spring there; "
+                f"use --pendulum, or --from a time when it is small."
+            )
+    held = _held(measured.times, flat)
+    if held > period / 6 and not model.drive:
+        yield (
+            f"The first {held:.2g} s stand still: the release is in the record, the model starts free; "
+            f"use --from {measured.times[0] + held + period / 4:.3g}."
+        )
+    if not model.pairs and model.drive is None:
+        known = [mode.angular_frequency for mode in found.modes]
+        width = 2 * np.pi / float(np.ptp(measured.times))
+        lines = {round(o, 6): a for column in flat.T for o, a in strong_lines(measured.times, column)}
+        strange = [o for o in lines if all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))]
+        if strange:
+            frequencies = listed([f"{o / (2 * np.pi):.3g} Hz" for o in sorted(strange)])
+            yield (
+                f"The data hold another oscillation, at {frequencies}, that the model lacks: add the particles and "
+                f"springs that make it (--edges), fit a direction alone (--columns), or cut it out (--from, --to)."
+            )
+
+
+def _held(times: np.ndarray, flat: np.ndarray) -> float:
+    """How long the motion stands still at the beginning, s."""
+    extent = np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0)
+    moving = flat[:, extent >= 0.3 * np.nanmax(extent)]
+    start = np.nanmedian(moving[:5], axis=0)
+    away = np.abs(moving - start) > 0.05 * (np.nanmax(moving, axis=0) - np.nanmin(moving, axis=0))
+    first = int(np.argmax(away.any(axis=1)))
+    return float(times[first] - times[0])
+
+
+def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) -> Iterator[str]:
+    residual = (measured.positions - found.predicted).reshape(len(measured.times), -1)
+    spread = float(np.nanstd(measured.positions - np.nanmean(measured.positions, axis=0)))
+    rms = float(np.sqrt(np.nanmean(residual**2)))
+    share = rms / spread if spread else 0.0
+    lag = lag_one(residual)
+    if share > 0.5:
+        yield (
+            f"The model explains {max(0.0, 100 * (1 - share**2)):.0f} % of the variance only: its numbers mean "
+            f"nothing. Look at the picture and at `jeuler look`; choose columns, run or span."
+        )
+        return
+    if share > LARGE_RESIDUAL and lag > 0.5:
+        yield (
+            f"The residual is {100 * share:.2g} % of the motion's spread and not noise (neighbours correlate by "
+            f"{lag:.2f}): the model lacks something. Try --friction compare; look at the picture for a second motion, "
+            f"a release, a knock, or a drift."
+        )
+    early = measured.times < measured.times[0] + np.pi / guess.angular_frequency
+    if early.sum() > 3 and (~early).sum() > 3 and np.isfinite(residual[early]).any():
+        begin, rest = np.sqrt(np.nanmean(residual[early] ** 2)), np.sqrt(np.nanmean(residual[~early] ** 2))
+        if begin > 4 * rest and share > LARGE_RESIDUAL / 4:
+            yield (
+                f"The first half period fits {begin / rest:.0f} times worse than the rest: a release or a hand may be "
+                f"in it; use --from {measured.times[~early][0]:.3g}."
+            )
+
+
+def _parameter_words(found: Estimate) -> Iterator[str]:
+    if not found.converged:
+        yield "The fit did not converge: raise --max-iterations, or give a start near the truth with --start."
+    ks = np.atleast_1d(found.params["ks"])
+    if (ks < 0).any():
+        yield "A stiffness came out negative: the model is wrong for these data; look at the columns and --edges."
+    for what in found.at_zero:
+        yield f"The best {what} would be negative; it is held at 0: the data show none, or the model lacks a drive."
+
+
+def lag_one(residual: np.ndarray) -> float:
+    """The correlation of neighbours, averaged over the columns by their sizes."""
+    centred = residual - np.nanmean(residual, axis=0)
+    products, squares = np.nansum(centred[1:] * centred[:-1]), np.nansum(centred**2)
+    return float(products / squares) if squares > 0 else 0.0

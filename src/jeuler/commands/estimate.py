@@ -1,0 +1,268 @@
+"""The fit of a model to a measurement: start, descent, bounds at zero, intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler._core.component import replace
+from jeuler.commands.linear_start import equation_of_motion, network_start, state_start
+from jeuler.commands.model import Model, steps_to
+from jeuler.commands.selection import Measurement
+from jeuler.fitting import fit
+from jeuler.fitting.observations import horizons
+from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes, modes_of
+from jeuler.fitting.spectrum import power_spectrum, strong_lines
+from jeuler.particles.scene import Scene
+
+STEPS_A_PERIOD = 40
+MOST_STEPS = 1_000_000
+NOT_NEGATIVE = ("kd", "quadratic", "dry")
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What was found.
+
+    Attributes:
+      model, params: the model and its parameters.  stderr: of the same structure, widened; inf where not determined.
+      widening: by how much the errors for white residuals were multiplied.
+      at_zero: the parameters that ended at their bound 0, in words.
+      predicted: at the measured times, (time, particle, dim).  dt: step size, s.
+      loss: mean square of the residual.  iterations, converged, message: of the descent.  scene, mass: as fitted.
+    """
+
+    model: Model
+    params: dict[str, Any]
+    stderr: dict[str, Any]
+    widening: float
+    at_zero: tuple[str, ...]
+    predicted: np.ndarray
+    dt: float
+    loss: float
+    iterations: int
+    converged: bool
+    message: str
+    scene: Scene
+    mass: np.ndarray
+
+    @property
+    def modes(self) -> list[Mode]:
+        """Modes of the linear part of the model; about the mean of the motion where positions are places."""
+        if not self.model.places:
+            ks = np.atleast_1d(self.params["ks"])
+            kd = np.atleast_1d(self.params.get("kd", np.zeros_like(ks)))
+            each = modes_of(equation_of_motion(self.model, ks, kd, self.mass))
+            return each[:1] if self.model.shared and len(set(self.mass.tolist())) == 1 else each
+        _, state = self.model.scene(self.params)
+        position = np.concatenate([self.predicted.mean(axis=0), self.params["anchors"]])
+        return modes(self.scene, replace(state, position=jnp.asarray(position)))
+
+
+def guess_of(measured: Measurement) -> Oscillation:
+    """Frequency and decay of the strongest line."""
+    try:
+        return estimate_oscillation(measured.times, measured.positions.reshape(len(measured.times), -1))
+    except ValueError as error:
+        raise ValueError(f"{measured.source}: {error}") from None
+
+
+def step_size(measured: Measurement, guess: Oscillation, asked: float | None) -> float:
+    """A 40th of the shortest period, a 100th of the record at most."""
+    flat = measured.positions.reshape(len(measured.times), -1)
+    lines = [omega for column in flat.T for omega, _ in strong_lines(measured.times, column)]
+    period = 2 * np.pi / max([guess.angular_frequency, *(o for o in lines if o < 8 * guess.angular_frequency)])
+    span = float(np.ptp(measured.times))
+    if asked is None:
+        return min(period / STEPS_A_PERIOD, span / 100)
+    if asked > period / 10:
+        raise ValueError(f"--dt {asked:g}: must be below a tenth of the period of {period:.3g} s; leave it out")
+    if span / asked > MOST_STEPS:
+        raise ValueError(
+            f"--dt {asked:g}: {span / asked:.3g} steps over {span:.3g} s, at most {MOST_STEPS}; leave it out"
+        )
+    return asked
+
+
+def starting_values(
+    model: Model, measured: Measurement, guess: Oscillation, asked: dict[str, float]
+) -> tuple[dict[str, Any], bool]:
+    """Where the descent begins, and whether it should grow the horizon as it is far from a linear model."""
+    mean_mass = float(np.nanmean(model.mass))
+    springs = 1 if (model.shared or model.pendulum or model.cubic) else len(model.labels)
+    omega = guess.angular_frequency
+    if model.pendulum:
+        swing = np.nanmax(np.abs(measured.positions - np.nanmean(measured.positions, axis=0)))
+        omega = omega / max(1 - min(swing, 2.5) ** 2 / 16, 0.5)
+    ks = np.full(springs, asked.get("ks", mean_mass * omega**2))
+    kd = np.full(springs, asked.get("kd", 2 * mean_mass * guess.decay_rate))
+    mass = np.where(np.isnan(model.mass), mean_mass, model.mass)
+    coupled = bool(model.pairs) and not model.places
+    if coupled and model.dim == 1 and model.observe in ("position", "angle") and not asked:
+        ks, kd, mass = network_start(model, measured, guess)
+        ks = np.maximum(ks, 1e-6 * ks.max())
+    start: dict[str, Any] = {"ks": ks, "kd": kd}
+    if model.places:
+        start |= _places(model, measured)
+    else:
+        start |= state_start(model, measured, ks, kd, np.maximum(mass, 1e-9))
+    if np.isnan(model.mass).any():
+        start["mass"] = mass[np.isnan(model.mass)]
+    if model.spring_mass:
+        start["spring_mass"] = np.asarray(0.0)
+    speed = max(model.slow * 50, 1e-12)
+    if "quadratic" in model.friction:
+        start["quadratic"] = np.asarray(0.3 * kd.mean() / speed)
+    if "dry" in model.friction:
+        start["dry"] = np.asarray(0.3 * kd.mean() * speed)
+    if "viscous" not in model.friction:
+        del start["kd"]
+    if model.cubic:
+        start["cubic"] = np.asarray(0.0)
+    if model.drive is not None:
+        start["gain"] = np.asarray(0.0)
+    return start, model.pendulum or model.places or model.cubic or bool(asked) or (coupled and model.dim > 1)
+
+
+def _places(model: Model, measured: Measurement) -> dict[str, Any]:
+    rest = np.nanmean(measured.positions, axis=0)
+    seen = np.isfinite(measured.positions).all(axis=2)
+    first = [measured.positions[np.argmax(seen[:, k]), k] if seen[:, k].any() else rest[k] for k in range(len(rest))]
+    i, j = np.array(model.pairs).T
+    lengths = np.nanmean(np.linalg.norm(measured.positions[:, i] - measured.positions[:, j], axis=-1), axis=0)
+    return {
+        "position": np.stack(first),
+        "velocity": np.zeros_like(rest),
+        "anchors": rest[list(model.anchored)],
+        "rest_length": lengths,
+    }
+
+
+def estimate(
+    model: Model, measured: Measurement, guess: Oscillation, dt: float, asked: dict[str, float], max_iterations: int
+) -> Estimate:
+    """Fit the model; what becomes negative and cannot be is put at 0 and the rest fitted again."""
+    start, grow = starting_values(model, measured, guess, asked)
+    unknowns, samples = sum(np.size(x) for x in start.values()), int(np.isfinite(measured.positions).sum())
+    if samples <= unknowns:
+        raise ValueError(
+            f"{measured.source}: {samples} values cannot determine {unknowns} unknowns ({', '.join(start)}); "
+            f"record more"
+        )
+    scale = _scales(model, measured, guess, start)
+    held: dict[str, Any] = {}
+    params, stage = start, grow
+    for _ in range(4):
+        found, predict = _descend(model, measured, params, held, scale, dt, stage, max_iterations)
+        below = {name: np.asarray(found.params[name]) < 0 for name in NOT_NEGATIVE if name in found.params}
+        held, before = {name: held.get(name, False) | mask for name, mask in below.items()}, held
+        if not any(mask.any() for mask in below.values()):
+            held = before
+            break
+        params = {k: np.where(held[k], 0.0, v) if k in held else np.asarray(v) for k, v in found.params.items()}
+        stage = False
+    predicted = np.asarray(jax.jit(predict)(found.params))
+    widening = 1.0 if hasattr(found, "stderr_white") else _widening(measured, predicted, guess)
+    n = model.particles
+    stderr = {name: np.asarray(error) * widening for name, error in found.stderr.items()}
+    scene, state = model.scene(found.params)
+    return Estimate(
+        model=model,
+        params={name: np.where(held.get(name, False), 0.0, value) for name, value in found.params.items()},
+        stderr=stderr,
+        widening=widening,
+        at_zero=_held_words(model, held),
+        predicted=predicted,
+        dt=dt,
+        loss=float(found.loss),
+        iterations=len(found.history),
+        converged=bool(found.converged),
+        message="converged" if found.converged else f"not converged in {len(found.history)} iterations",
+        scene=scene,
+        mass=np.asarray(state.mass)[:n],
+    )
+
+
+def _held_words(model: Model, held: dict[str, Any]) -> tuple[str, ...]:
+    """What is held at 0, in words."""
+    words = {"quadratic": "quadratic drag", "dry": "dry friction"}
+    told = [words[name] for name in words if np.any(held.get(name, False))]
+    springs = [label for label, mask in zip(model.labels, np.atleast_1d(held.get("kd", False)), strict=False) if mask]
+    if springs:
+        told.append("damping kd" + (f" of {', '.join(springs)}" if len(model.labels) > 1 else ""))
+    return tuple(told)
+
+
+def _scales(model: Model, measured: Measurement, guess: Oscillation, start: dict[str, Any]) -> dict[str, Any]:
+    """A large but sensible change of each parameter."""
+    ks = float(np.max(start["ks"]))
+    omega = guess.angular_frequency
+    spread = float(np.nanstd(measured.positions)) or 1.0
+    amplitude = {"acceleration": spread / omega**2, "velocity": spread / omega, "angular velocity": spread / omega}.get(
+        model.observe, spread
+    )
+    return {
+        "ks": 0.3 * ks,
+        "kd": 0.1 * ks / omega,
+        "position": amplitude,
+        "velocity": amplitude * omega,
+        "offset": spread,
+        "anchors": amplitude,
+        "rest_length": amplitude,
+        "mass": 0.3 * float(np.nanmean(model.mass)),
+        "spring_mass": 0.1 * float(np.nanmean(model.mass)),
+        "quadratic": 0.1 * ks / omega / (amplitude * omega),
+        "dry": 0.1 * ks * amplitude,
+        "cubic": 0.3 * ks / amplitude**2,
+        "gain": ks,
+    }
+
+
+def _descend(
+    model: Model,
+    measured: Measurement,
+    start: dict[str, Any],
+    held: dict[str, Any],
+    scale: dict[str, Any],
+    dt: float,
+    grow: bool,
+    max_iterations: int,
+) -> tuple[Any, Any]:
+    seen = np.nonzero(np.isfinite(measured.positions))
+    targets = jnp.asarray(measured.positions[seen])
+    t0, count = float(measured.times[0]), steps_to(measured, dt)
+
+    def predict(params: dict[str, Any]) -> jax.Array:
+        free = {k: jnp.where(jnp.asarray(held[k]), 0.0, v) if k in held else v for k, v in params.items()}
+        return model.predict(free, measured.times, dt, t0, count)
+
+    found = fit(
+        lambda params: predict(params)[seen] - targets,
+        {name: jnp.asarray(value, float) for name, value in start.items()},
+        scale={name: scale[name] for name in start},
+        stages=horizons(measured.times[seen[0]] - t0) if grow else (),
+        max_iterations=max_iterations,
+        tolerance=1e-7,
+        progress=False,
+    )
+    return found, predict
+
+
+def _widening(measured: Measurement, predicted: np.ndarray, guess: Oscillation) -> float:
+    """How much larger the errors are than for white residuals: the residual's spectrum near the motion's frequency,
+    where ks and kd are read off, against its mean; its root, at least 1."""
+    widest = 1.0
+    span = float(np.ptp(measured.times))
+    residual = (measured.positions - predicted).reshape(len(measured.times), -1)
+    for column in residual.T:
+        if np.isfinite(column).sum() < 20:
+            continue
+        frequencies, power = power_spectrum(measured.times, column, span)
+        near = np.abs(frequencies / guess.angular_frequency - 1) < 0.5
+        if near.sum() >= 8 and power.mean() > 0:
+            widest = max(widest, float(np.sqrt(power[near].mean() / power.mean())))
+    return widest

@@ -1,0 +1,129 @@
+"""Where a fit starts: stiffness, damping and initial state of a linear model, from the data by linear least squares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jeuler.commands.model import Model
+from jeuler.commands.selection import Measurement
+from jeuler.fitting.oscillation import Oscillation
+from jeuler.fitting.spectrum import strong_lines
+
+
+def network_start(model: Model, measured: Measurement, guess: Oscillation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ks and kd of each spring and the mass of each particle, by the weak form of the equation of motion.
+
+        integral of w'' m x  =  - sum over springs of ks integral of w (x_i - x_j) + kd integral of w' (x_i - x_j)
+
+    with bumps w = (1 - z^2)^4 that end in the record; both sides are linear in ks, kd, unknown masses and a constant.
+    Positions of particles on one line, on any even or uneven clock. ks, kd >= 0.
+    """
+    from scipy.optimize import lsq_linear
+
+    lines = [
+        omega
+        for column in measured.positions.reshape(len(measured.times), -1).T
+        for omega, _ in strong_lines(measured.times, column)
+    ] or [guess.angular_frequency]
+    t = measured.times
+    half = max(np.pi / max(lines), 4 * float(np.median(np.diff(t))))
+    centres = np.arange(t[0] + half, t[-1] - half, half / 3)
+    if len(centres) < 4:
+        raise ValueError("too short for the weak form")
+    first, second, plain = _moments(t, measured.positions[..., 0], centres, half)
+    springs = [(k, None) for k in model.anchored] + list(model.pairs)
+    free = np.flatnonzero(np.isnan(model.mass))
+    n, count = model.particles, len(centres)
+    columns = 2 * len(springs) + len(free) + n
+    matrix, right = np.zeros((n, count, columns)), np.zeros((n, count))
+    for e, (i, j) in enumerate(springs):
+        for particle, sign in ((i, 1.0), (j, -1.0)):
+            if particle is None:
+                continue
+            for source, value in ((plain, e), (-first, len(springs) + e)):
+                stretch = source[:, i] - (source[:, j] if j is not None else 0.0)
+                matrix[particle, :, value] += sign * stretch
+    for k in range(n):
+        matrix[k, :, 2 * len(springs) + len(free) + k] = half  # a constant force: the place of rest
+        if k in free:
+            matrix[k, :, 2 * len(springs) + int(np.searchsorted(free, k))] = second[:, k]
+        else:
+            right[k] = -model.mass[k] * second[:, k]
+    a, b = matrix.reshape(-1, columns), right.ravel()
+    keep = np.isfinite(a).all(axis=1) & np.isfinite(b)
+    scale = np.maximum(np.linalg.norm(a[keep], axis=0), 1e-300)
+    low = np.r_[np.zeros(2 * len(springs) + len(free)), np.full(n, -np.inf)]
+    x = lsq_linear(a[keep] / scale, b[keep], (low, np.full(columns, np.inf))).x / scale
+    mass = np.array(model.mass)
+    mass[free] = x[2 * len(springs) : 2 * len(springs) + len(free)]
+    return x[: len(springs)], x[len(springs) : 2 * len(springs)], mass
+
+
+def _moments(
+    t: np.ndarray, x: np.ndarray, centres: np.ndarray, half: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Integrals of w' x, w'' x and w x over each bump, (bump, particle); NaN where a bump meets a gap."""
+    sums = np.full((3, len(centres), x.shape[1]), np.nan)
+    for c, centre in enumerate(centres):
+        inside = np.flatnonzero(np.abs(t - centre) < half)
+        if len(inside) < 5:
+            continue
+        z = (t[inside] - centre) / half
+        weights = np.gradient(t[inside])[:, None]
+        bump = np.stack(
+            [
+                -8 * z * (1 - z**2) ** 3 / half,
+                (-8 * (1 - z**2) ** 3 + 48 * z**2 * (1 - z**2) ** 2) / half**2,
+                (1 - z**2) ** 4,
+            ]
+        )
+        piece = np.where(np.isfinite(x[inside]), x[inside], np.nan)
+        sums[:, c] = bump @ (piece * weights)
+    return sums[0], sums[1], sums[2]
+
+
+def equation_of_motion(model: Model, ks: np.ndarray, kd: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """The matrix of y' = matrix y, y = (displacements, velocities) along one coordinate."""
+    n = model.particles
+    stiffness, damping = np.zeros((n, n)), np.zeros((n, n))
+    edges = [(k, None) for k in model.anchored] + list(model.pairs)
+    for e, (i, j) in enumerate(edges):
+        for matrix, value in ((stiffness, ks), (damping, kd)):
+            strength = value[min(e, len(value) - 1)]
+            matrix[i, i] += strength
+            if j is not None:
+                matrix[j, j] += strength
+                matrix[i, j] -= strength
+                matrix[j, i] -= strength
+    return np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness / mass[:, None], -damping / mass[:, None]]])
+
+
+def state_start(
+    model: Model, measured: Measurement, ks: np.ndarray, kd: np.ndarray, mass: np.ndarray
+) -> dict[str, Any]:
+    """Initial position, velocity and offset of each particle with which the linear model comes nearest to the data."""
+    n = model.particles
+    system = equation_of_motion(model, ks, kd, mass)
+    system = system + 1e-9 * np.abs(system).max() * np.diag(np.arange(2 * n))  # no two eigenvalues equal
+    values, vectors = np.linalg.eig(system)
+    t = measured.times - measured.times[0]
+    modal = np.exp(np.clip(values[None, :].real, None, 0) * t[:, None] + 1j * values[None, :].imag * t[:, None])
+    flow = np.einsum("am,tm,mb->tab", vectors, modal, np.linalg.inv(vectors)).real
+    if model.observe in ("position", "angle"):
+        rows = flow[:, :n]
+    elif model.observe in ("velocity", "angular velocity"):
+        rows = flow[:, n:]
+    else:
+        rows = np.einsum("ab,tbc->tac", system[n:], flow)
+    start = np.zeros((2 * n, model.dim))
+    offset = np.zeros((n, model.dim))
+    for axis in range(model.dim):
+        observed = measured.positions[..., axis]
+        design = np.concatenate([rows, np.broadcast_to(np.eye(n), (len(t), n, n))], axis=2).reshape(len(t) * n, -1)
+        target = observed.reshape(-1)
+        seen = np.isfinite(target)
+        solution = np.linalg.lstsq(design[seen], target[seen], rcond=1e-10)[0]
+        start[:, axis], offset[:, axis] = solution[: 2 * n], solution[2 * n :]
+    return {"position": start[:n], "velocity": start[n:], "offset": offset}

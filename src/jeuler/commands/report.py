@@ -1,0 +1,244 @@
+"""The result as text and as JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jeuler.commands.cautions import lag_one
+from jeuler.commands.estimate import Estimate
+from jeuler.commands.options import EXAMPLE
+from jeuler.commands.selection import Measurement
+from jeuler.fitting.recordings.table import listed
+
+SCHEMA, VERSION = "jeuler.fit", 1
+G = 9.80665
+
+
+def report(measured: Measurement, found: Estimate, warnings: list[str]) -> dict[str, Any]:
+    """Everything that is printed and written, as plain numbers; the schema is in docs/recordings.md."""
+    model = found.model
+    rms = float(np.sqrt(found.loss))
+    away = measured.positions - np.nanmean(measured.positions, axis=0)
+    amplitude = float(np.nanmax(np.linalg.norm(np.where(np.isfinite(away), away, 0), axis=-1)))
+    residual = (measured.positions - found.predicted).reshape(len(measured.times), -1)
+    sampling = measured.sampling
+    return {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "source": measured.source,
+        "run": measured.run,
+        "time": measured.clock,
+        "columns": measured.names,
+        "quantity": measured.quantity,
+        "unit": measured.unit,
+        "span": [float(measured.times[0]), float(measured.times[-1])],
+        "rate": None if sampling is None else _plain(sampling.rate),
+        "left_out": [{"column": name, "reason": reason} for name, reason in measured.left_out],
+        "notes": list(measured.notes),
+        "warnings": warnings,
+        "samples": int(np.isfinite(measured.positions).sum()),
+        "mass": found.mass.tolist(),
+        "springs": _springs(found),
+        "friction": list(model.friction),
+        **_extras(found),
+        "modes": [{"natural_frequency": m.angular_frequency, "damping_ratio": m.damping_ratio} for m in found.modes],
+        "equation": equation(measured, found),
+        "rms": rms,
+        "amplitude": amplitude,
+        "share_of_amplitude": rms / amplitude if amplitude else 0.0,
+        "residual_lag_one": lag_one(residual),
+        "stderr_widened_by": found.widening,
+        "dt": float(found.dt),
+        "iterations": found.iterations,
+        "converged": found.converged,
+        "message": found.message,
+    }
+
+
+def _springs(found: Estimate) -> list[dict[str, Any]]:
+    ks, ks_error = np.atleast_1d(found.params["ks"]), np.atleast_1d(found.stderr["ks"])
+    kd = np.atleast_1d(found.params.get("kd", np.zeros_like(ks)))
+    kd_error = np.atleast_1d(found.stderr.get("kd", np.full_like(ks, np.inf)))
+    return [
+        {
+            "edge": label,
+            "ks": float(ks[k]),
+            "ks_stderr": _plain(ks_error[k]),
+            "kd": float(kd[k]),
+            "kd_stderr": _plain(kd_error[k]),
+        }
+        for k, label in enumerate(found.model.labels)
+    ]
+
+
+def _extras(found: Estimate) -> dict[str, Any]:
+    """Parameters that only some models have."""
+    names = {
+        "quadratic": "drag_coefficient",
+        "dry": "dry_friction",
+        "spring_mass": "spring_mass",
+        "cubic": "cubic",
+        "gain": "gain",
+    }
+    extras: dict[str, Any] = {}
+    for name, key in names.items():
+        if name in found.params:
+            extras[key] = float(found.params[name])
+            extras[key + "_stderr"] = _plain(float(found.stderr[name]))
+    if "mass" in found.params:
+        extras["mass_stderr"] = [_plain(x) for x in np.atleast_1d(found.stderr["mass"])]
+    if "anchors" in found.params:
+        extras["rest_position"] = found.params["anchors"].tolist()
+    elif found.model.observe in ("position", "angle"):
+        extras["rest_position"] = found.params["offset"].tolist()
+    else:
+        extras["offset"] = found.params["offset"].tolist()
+    if found.model.pendulum:
+        extras["pendulum_length"] = G / float(np.atleast_1d(found.params["ks"])[0]) * float(found.mass[0])
+    return extras
+
+
+def _plain(x: Any) -> float | None:
+    """A number that JSON can hold."""
+    return float(x) if np.isfinite(x) else None
+
+
+def equation(measured: Measurement, found: Estimate) -> str:
+    """The equation of motion of the first particle, with its numbers in it; "" for several particles."""
+    model, params = found.model, found.params
+    if model.particles > 1 and not model.shared:
+        return ""
+    rest = float(np.ravel(params["offset"])[0]) if model.observe in ("position", "angle") and model.dim == 1 else 0.0
+    letter = "angle" if model.pendulum or model.observe.startswith("ang") else "x"
+    place = f"({letter} - {rest:.4g})".replace("- -", "+ ") if rest else letter
+    ks = float(np.atleast_1d(params["ks"])[0])
+    mass = f"{found.mass[0]:.4g}" if not model.shared else "m"
+    parts = [
+        f"{mass} {letter}'' = -{ks:.5g} " + (f"sin{place if rest else f'({letter})'}" if model.pendulum else place)
+    ]
+    if "cubic" in params:
+        parts.append(f"- {float(params['cubic']):.4g} {place}^3")
+    if "kd" in params:
+        parts.append(f"- {float(np.atleast_1d(params['kd'])[0]):.4g} {letter}'")
+    if "quadratic" in params:
+        parts.append(f"- {float(params['quadratic']):.4g} |{letter}'| {letter}'")
+    if "dry" in params:
+        parts.append(f"- {float(params['dry']):.4g} sign({letter}')")
+    if "gain" in params:
+        parts.append(f"+ {float(params['gain']):.4g} u(t)")
+    return " ".join(parts).replace("- -", "+ ")
+
+
+def lines(told: dict[str, Any], picture: str | None, example: bool) -> list[str]:
+    """The result as lines of text."""
+    text = [_heading(told)]
+    text += [f"  {'used':<24} {_used(told)}"]
+    if told["left_out"]:
+        out = [f"{entry['column']} ({entry['reason']})" for entry in told["left_out"]]
+        text.append(f"  {'left out':<24} {listed(out)}")
+    text += [f"  {'note':<24} {note}" for note in told["notes"]]
+    units = _units(told)
+    for spring in told["springs"]:
+        where = "" if len(told["springs"]) == 1 else f" of {spring['edge']}"
+        for name in ("ks", "kd"):
+            if name == "kd" and "viscous" not in told["friction"]:
+                continue
+            note = f"   (true {EXAMPLE[name]:g})" if example else ""
+            text.append(_line(name + where, spring[name], spring[name + "_stderr"], units[name], note))
+    for key, name in (
+        ("drag_coefficient", "drag coefficient"),
+        ("dry_friction", "dry friction"),
+        ("spring_mass", "mass of the spring"),
+        ("cubic", "cubic stiffness"),
+        ("gain", "gain of the input"),
+    ):
+        if key in told:
+            text.append(_line(name, told[key], told[key + "_stderr"], units[key]))
+    if "pendulum_length" in told:
+        text.append(f"  {'length':<24} {told['pendulum_length']:.4g} m, of a point mass at g = {G} m/s^2")
+    for mode in told["modes"]:
+        omega = mode["natural_frequency"]
+        hertz = omega / (2 * np.pi)
+        text.append(f"  {'natural frequency':<24} {omega:.5g} rad/s = {hertz:.4g} Hz (squared {omega**2:.4g} 1/s^2)")
+        text.append(f"  {'damping ratio':<24} {mode['damping_ratio']:.4g}")
+    if told["equation"]:
+        text.append(f"  {'equation':<24} {told['equation']}")
+    unit = told["unit"]
+    share = f"{100 * told['share_of_amplitude']:.2g} % of the amplitude {told['amplitude']:.3g} {unit}"
+    text.append(f"  {'residual RMS':<24} {told['rms']:.3g} {unit}, {share}")
+    if told["stderr_widened_by"] > 1.05:
+        text.append(f"  {'errors':<24} widened {told['stderr_widened_by']:.2g} times, as the residual is correlated")
+    text.append(f"  {'trust':<24} {_trust(told)}")
+    text.append(f"  {'fit':<24} {told['message']}, {told['iterations']} iterations")
+    text.append(f"  {'time':<24} {told['seconds']:.1f} s in all")
+    if picture is not None:
+        text.append(f"  {'picture':<24} {picture}")
+    text += [f"  {'WARNING':<24} {warning}" for warning in told["warnings"]]
+    return text
+
+
+def _heading(told: dict[str, Any]) -> str:
+    masses = ", ".join(f"{m:.4g}" for m in told["mass"])
+    run = f", run {told['run']}" if told["run"] else ""
+    inertia = "inertia" if told["quantity"].startswith("ang") else "mass"
+    unit = "kg m^2" if inertia == "inertia" else "kg"
+    return f"{told['source']}{run}: {told['samples']} samples, {inertia} {masses} {unit}"
+
+
+def _used(told: dict[str, Any]) -> str:
+    rate = f", {told['rate']:.4g} samples a second" if told["rate"] else ""
+    names = listed(list(dict.fromkeys(told["columns"])))
+    begin, end = told["span"]
+    return f"{told['quantity']} {names} in {told['unit']} over {told['time']} from {begin:.5g} to {end:.5g} s{rate}"
+
+
+def _units(told: dict[str, Any]) -> dict[str, str]:
+    if told["quantity"] in ("angle", "angular velocity"):
+        return {
+            "ks": "N m/rad",
+            "kd": "N m s/rad",
+            "drag_coefficient": "N m s^2/rad^2",
+            "dry_friction": "N m",
+            "spring_mass": "kg m^2",
+            "cubic": "N m/rad^3",
+            "gain": "N m per unit",
+        }
+    return {
+        "ks": "N/m",
+        "kd": "N s/m",
+        "drag_coefficient": "kg/m",
+        "dry_friction": "N",
+        "spring_mass": "kg",
+        "cubic": "N/m^3",
+        "gain": "N per unit",
+    }
+
+
+def _line(name: str, value: float, error: float | None, unit: str, note: str = "") -> str:
+    spread = f" ± {error:.2g}" if error is not None else ("" if value == 0 else " (not determined by the data)")
+    return f"  {name:<24} {value:.5g}{spread} {unit}{note}"
+
+
+def _trust(told: dict[str, Any]) -> str:
+    """How far each number is to be trusted, in one line."""
+    words = []
+    for spring in told["springs"]:
+        where = "" if len(told["springs"]) == 1 else f" of {spring['edge']}"
+        for name in ("ks", "kd"):
+            if name == "kd" and "viscous" not in told["friction"]:
+                continue
+            value, error = spring[name], spring[name + "_stderr"]
+            if value == 0:
+                words.append(f"{name}{where} at its bound 0")
+            elif error is None:
+                words.append(f"{name}{where} not determined")
+            else:
+                words.append(f"{name}{where} to {_percent(200 * error / abs(value))}")
+    ending = " (95 %), if the model is right" + ("; see the warnings" if told["warnings"] else "")
+    return ", ".join(words) + ending
+
+
+def _percent(share: float) -> str:
+    return "no better than its size" if share >= 100 else f"{max(share, 0.001):.2g} %"

@@ -1,0 +1,329 @@
+"""What is fitted: the run, the columns and the span of a recording, as the options or the file's names say."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import re
+from typing import Any
+
+import numpy as np
+
+from jeuler.fitting.oscillation import estimate_oscillation
+from jeuler.fitting.recordings.clock import Sampling, sampling
+from jeuler.fitting.recordings.columns import Column
+from jeuler.fitting.recordings.reading import read_table
+from jeuler.fitting.recordings.recording import Recording, longest, understand
+from jeuler.fitting.recordings.table import listed
+from jeuler.fitting.spectrum import block_means, strong_lines
+from jeuler.fitting.trajectory import chosen_run
+
+LEAST_ROWS = 5
+THIN_ABOVE = 20_000  # rows
+SAMPLES_A_PERIOD = 40
+OBSERVED = ("position", "angle", "acceleration", "velocity", "angular velocity")  # the first that is there is taken
+UNITS = {"position": "m", "angle": "rad", "acceleration": "m/s^2", "velocity": "m/s", "angular velocity": "rad/s"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurement:
+    """What is fitted.
+
+    Attributes:
+      source: the file.  run: its label, "" where the file has one.  clock: the name of the time column.
+      times: (time,), s.  positions: values of the observed quantity, (time, particle, dim), in `unit`.
+      names: (particle * dim,).  quantity, unit: of the values.  left_out: (name, reason) of the other columns.
+      notes: what was done, as sentences.  warnings: what may be wrong, as sentences with what to do.
+      sampling: the clock before thinning.  recordings: how many of them are fitted together, one a particle.
+    """
+
+    source: str
+    run: str
+    clock: str
+    times: np.ndarray
+    positions: np.ndarray
+    names: list[str]
+    quantity: str = "position"
+    unit: str = "m"
+    left_out: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    sampling: Sampling | None = None
+    recordings: int = 1
+
+
+def recordings_in(source: Any, arguments: Any) -> list[Recording]:
+    """The runs in a file, as understood with what the options correct."""
+    table = read_table(source, arguments.skip or 0)
+    return understand(table, arguments.time, _units(arguments.unit, table.names))
+
+
+def _units(text: str | None, names: list[str]) -> dict[str, str]:
+    """x=mm,t=ms as units by column name."""
+    units = {}
+    for part in text.split(",") if text else []:
+        name, equals, unit = part.rpartition("=")
+        found = resolve(name.strip(), names) if equals else None
+        if found is None or not unit.strip():
+            raise ValueError(
+                f"--unit must be like x=mm,t=ms with names of columns, got {part.strip()!r}; "
+                f"the columns are {listed(names)}"
+            )
+        units[found] = unit.strip()
+    return units
+
+
+def resolve(name: str, available: list[str]) -> str | None:
+    """The column that is meant: by its name, or else, where only one is so, by its beginning or in another case."""
+    if name in available:
+        return name
+    alike = [a for a in available if a.lower() == name.lower()] or [
+        a for a in available if name and re.match(re.escape(name.lower()) + r"($|[^a-z0-9])", a.lower())
+    ]
+    return alike[0] if len(alike) == 1 else None
+
+
+def select(recordings: list[Recording], arguments: Any) -> Measurement:
+    """The run, columns and span to be fitted."""
+    if arguments.run == "all":
+        return together([_one(recording, arguments) for recording in recordings])
+    recording = longest(recordings) if arguments.run is None else chosen_run(recordings, arguments.run)
+    measured = _one(recording, arguments)
+    others = [f"{r.run} ({len(r.times)} rows)" for r in recordings if r is not recording]
+    if not others:
+        return dataclasses.replace(measured, run="")
+    note = f"Run {recording.run} of {len(recordings)} is used; the others are {listed(others)}: --run N or --run all."
+    return dataclasses.replace(measured, notes=(*measured.notes, note))
+
+
+def _one(recording: Recording, arguments: Any) -> Measurement:
+    columns, quantity, dim, left_out = choose_columns(recording, arguments)
+    warnings = []
+    begin, end = arguments.begin, arguments.end
+    times = recording.times
+    keep = np.ones(len(times), bool)
+    keep &= times >= begin if begin is not None else True
+    keep &= times <= end if end is not None else True
+    if keep.sum() < LEAST_ROWS:
+        raise ValueError(
+            f"{recording.source}: {keep.sum()} rows{' between --from and --to' if not keep.all() else ''}, expected "
+            f"{LEAST_ROWS} at least; the times run from {times.min():g} to {times.max():g} s"
+        )
+    places = [recording.columns.index(column) for column in columns]
+    values = recording.values[:, places][keep]
+    unknown = [column.name for column in columns if np.isnan(column.factor)]
+    if unknown:
+        warnings.append(
+            f"The unit of {listed(unknown)} has no known scale: positions are in {columns[0].unit}; "
+            f"ks and kd are right, as they do not depend on it, forces and amplitudes are not in SI units."
+        )
+    untold = [column.name for column in columns if not column.told]
+    if untold:
+        warnings.append(
+            f"Neither name nor unit says what {listed(untold)} is: taken as a position in m. "
+            f"Correct it with --observe or --unit."
+        )
+    unit = columns[0].unit if unknown else UNITS[quantity]
+    measured = Measurement(
+        source=recording.source,
+        run=recording.run,
+        clock=recording.clock.name,
+        times=times[keep],
+        positions=values.reshape(len(values), -1, dim),
+        names=[column.name for column in columns],
+        quantity=quantity,
+        unit=unit,
+        left_out=(*recording.left_out, *left_out),
+        notes=recording.notes,
+        warnings=(*recording.warnings, *warnings),
+    )
+    return thinned(dataclasses.replace(measured, sampling=sampling(measured.times)))
+
+
+def thinned(measured: Measurement) -> Measurement:
+    """Blocks of rows averaged to one, where there are far more than the motion needs."""
+    rows = len(measured.times)
+    if rows <= THIN_ABOVE:
+        return measured
+    flat = measured.positions.reshape(rows, -1)
+    try:
+        slowest = estimate_oscillation(measured.times, flat).angular_frequency
+    except ValueError as error:
+        raise ValueError(f"{measured.source}: {error}") from None
+    lines = [omega for column in flat.T for omega, _ in strong_lines(measured.times, column)]
+    period = 2 * np.pi / max([slowest, *lines])
+    block = int(min(rows / THIN_ABOVE, period / SAMPLES_A_PERIOD / (np.ptp(measured.times) / rows)))
+    if block < 2:
+        return measured
+    times = block_means(measured.times, block)
+    note = f"Of {rows} rows every {block} are averaged to one: {rows / np.ptp(measured.times) * period:.0f} a period."
+    return dataclasses.replace(
+        measured,
+        times=times,
+        positions=block_means(measured.positions, block),
+        notes=(*measured.notes, note),
+    )
+
+
+def together(measured: list[Measurement]) -> Measurement:
+    """Several recordings as one: a particle each, every clock from its first row, one quantity."""
+    first = measured[0]
+    for other in measured[1:]:
+        if (other.quantity, other.positions.shape[1:]) != (first.quantity, first.positions.shape[1:]):
+            raise ValueError(
+                f"recordings fitted together must hold the same: {first.source} has {first.quantity} of shape "
+                f"{first.positions.shape[1:]}, {other.source} {other.quantity} of {other.positions.shape[1:]}"
+            )
+    if first.positions.shape[1] != 1:
+        raise ValueError(f"recordings fitted together must hold one particle each, got {first.positions.shape[1]}")
+    clocks = [m.times - m.times[0] for m in measured]
+    times = np.unique(np.concatenate(clocks))
+    positions = np.full((len(times), len(measured), first.positions.shape[2]), np.nan)
+    for k, (clock, m) in enumerate(zip(clocks, measured, strict=True)):
+        positions[np.searchsorted(times, clock), k] = m.positions[:, 0]
+    sources = list(dict.fromkeys(m.source for m in measured))
+    return dataclasses.replace(
+        first,
+        source=", ".join(sources),
+        run=", ".join(m.run for m in measured if m.run),
+        times=times,
+        positions=positions,
+        names=[name for m in measured for name in m.names],
+        left_out=tuple(dict.fromkeys(pair for m in measured for pair in m.left_out)),
+        notes=tuple(dict.fromkeys(note for m in measured for note in m.notes)),
+        warnings=tuple(dict.fromkeys(warning for m in measured for warning in m.warnings)),
+        sampling=sampling(times),
+        recordings=len(measured),
+    )
+
+
+def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], str, int, list[tuple[str, str]]]:
+    """The columns that are fitted, what they are, coordinates a particle, and the columns left out with the reason."""
+    usable = [c for c in recording.columns if c.quantity != "text"]
+    if arguments.columns is not None:
+        columns = _named_columns(recording, arguments.columns)
+        quantity = arguments.observe or columns[0].quantity
+        others = [(c.name, "not among --columns") for c in recording.columns if c not in columns]
+    else:
+        usable = [c for c in usable if np.isfinite(recording.values[:, recording.columns.index(c)]).any()]
+        quantity = _quantity(recording, usable, arguments.observe)
+        columns = [c for c in usable if c.quantity == quantity]
+        others = [(c.name, _reason(c, quantity, c in usable)) for c in recording.columns if c not in columns]
+    quantity = quantity if quantity in OBSERVED else "position"
+    if arguments.columns is None and arguments.dim is None:
+        columns, more = _one_channel(recording, columns)
+        others += more
+    columns, dim = _particles(recording.source, columns, arguments)
+    return columns, quantity, dim, others
+
+
+def _quantity(recording: Recording, usable: list[Column], observe: str | None) -> str:
+    there = {c.quantity for c in usable}
+    if observe is not None:
+        if observe not in there and "" not in there:
+            raise ValueError(
+                f"{recording.source}: --observe {observe}: no column is one; the columns are "
+                f"{listed([f'{c.name} ({c.quantity})' for c in usable])}; choose with --columns"
+            )
+        return observe if observe in there else ""
+    for quantity in OBSERVED:
+        if quantity in there:
+            return quantity
+    if "" in there:
+        return ""
+    raise ValueError(
+        f"{recording.source}: no column is a position, an angle, an acceleration or a velocity; the columns are "
+        f"{listed([f'{c.name} ({c.quantity})' for c in usable]) or 'none'}; choose with --columns and --observe"
+    )
+
+
+def _reason(column: Column, quantity: str, usable: bool) -> str:
+    if column.quantity == "text":
+        return "text"
+    if not usable:
+        return "no values"
+    kinds = {
+        "": "not known what it is",
+        "index": "an index of the rows",
+        "absolute": "an absolute value, which has lost the sign",
+        "uncertainty": "an uncertainty",
+    }
+    return kinds.get(column.quantity, f"{column.quantity}, as there is {quantity or 'another'}")
+
+
+def _named_columns(recording: Recording, text: str) -> list[Column]:
+    """The columns of a list of names; a name may hold commas and quotes."""
+    available = [c.name for c in recording.columns if c.quantity != "text"]
+    names = _split_names(text, available)
+    unknown = [name for name in names if name not in available]
+    if unknown or not names:
+        raise ValueError(
+            f"{recording.source}: no column {unknown[0] if unknown else text!r}, the columns are {listed(available)}"
+            if unknown or text
+            else f"--columns must name columns, got an empty text; the columns are {listed(available)}"
+        )
+    repeated = [name for name in names if names.count(name) > 1]
+    if repeated:
+        raise ValueError(f"--columns names {repeated[0]!r} more than once")
+    columns = [recording.columns[[c.name for c in recording.columns].index(name)] for name in names]
+    kinds = {c.quantity for c in columns if c.quantity}
+    if len(kinds) > 1:
+        raise ValueError(f"--columns must name one quantity, got {', '.join(sorted(kinds))}")
+    return columns
+
+
+def _split_names(text: str, available: list[str]) -> list[str]:
+    """Names separated by commas: in quotes, or the longest run of parts that is a name of a column."""
+    if text in available:
+        return [text]
+    parts = [part.strip() for part in next(csv.reader([text], skipinitialspace=True), [])]
+    names: list[str] = []
+    while parts:
+        for count in range(len(parts), 0, -1):
+            found = resolve(", ".join(parts[:count]), available) or resolve(",".join(parts[:count]), available)
+            if found is not None:
+                break
+        names.append(found or parts[0])
+        parts = parts[count if found else 1 :]
+    return names
+
+
+def _one_channel(recording: Recording, columns: list[Column]) -> tuple[list[Column], list[tuple[str, str]]]:
+    """Of several channels that no axis or number tells apart, the one that swings most clearly."""
+    if len(columns) < 2 or any(c.axis or _number_of(c) for c in columns) or not all(c.told for c in columns):
+        return columns, []
+    clearest = max(columns, key=lambda c: _clearness(recording, c))
+    others = [(c.name, "another channel, which swings less clearly: --columns") for c in columns if c is not clearest]
+    return [clearest], others
+
+
+def _clearness(recording: Recording, column: Column) -> float:
+    """The share of the variance in the strongest line."""
+    x = recording.values[:, recording.columns.index(column)]
+    lines = strong_lines(recording.times, x, most=1)
+    return lines[0][1] ** 2 / np.nanvar(x) if lines else 0.0
+
+
+def _number_of(column: Column) -> str:
+    found = re.search(r"[A-Za-z_](\d+)(?=$|[^A-Za-z0-9]|_)", column.name)
+    return found.group(1) if found and column.told else ""
+
+
+def _particles(source: str, columns: list[Column], arguments: Any) -> tuple[list[Column], int]:
+    """The columns particle by particle, and how many coordinates each has."""
+    axes = [c.axis for c in columns]
+    if all(axes):
+        told = len(set(axes))
+    elif any(_number_of(c) for c in columns) and all(c.told for c in columns):
+        told = 1
+    else:
+        told = len(columns) if len(columns) <= 3 else 1
+    dim = told if arguments.dim is None else arguments.dim
+    if dim < 1 or len(columns) % dim:
+        raise ValueError(
+            f"{source}: {len(columns)} columns ({listed([c.name for c in columns])}) do not make particles of "
+            f"{dim} coordinates; choose with --columns and --dim"
+        )
+    if dim > 1 and all(axes) and any(len(set(axes[k : k + dim])) < dim for k in range(0, len(axes), dim)):
+        columns = sorted(columns, key=lambda c: (int(c.marker) if c.marker.isdigit() else 0, c.marker, c.axis))
+    return columns, dim
