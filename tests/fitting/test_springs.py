@@ -135,7 +135,8 @@ def test_times_off_the_grid_and_missing_cells(random):
 
 def test_gradient_descent_by_optax():
     scene, state = single(ks=6.0, kd=0.8)
-    found = jeuler.fit_springs(scene, state, TIMES, observed(), dt=0.04, optimizer=optax.adam(0.05), max_iterations=300)
+    adam = {"optimizer": optax.adam(0.05), "max_iterations": 300}
+    found = jeuler.fit_springs(scene, state, TIMES, observed(), dt=0.04, start="given", **adam)
     np.testing.assert_allclose((found.ks, found.kd), (KS, KD), rtol=1e-2)
     assert found.history[-1] < 1e-4 * found.history[0]
 
@@ -144,7 +145,7 @@ def test_growing_horizon_finds_the_period_that_the_whole_record_hides():
     """Nine periods, hardly damped: gradient descent in ks over all of it at once settles in a wrong valley."""
     times = np.linspace(0, 20, 150)[1:]
     scene, state = single(ks=25.0, kd=0.02)
-    run = {"dt": 0.08, "parameters": ("ks",)}
+    run = {"dt": 0.08, "parameters": ("ks",), "start": "given"}
     descent = {"optimizer": optax.adam(0.05), "max_iterations": 150, "grow": False}
     at_once = jeuler.fit_springs(scene, state, times, observed(times, 0.02), **run, **descent)
     grown = jeuler.fit_springs(scene, state, times, observed(times, 0.02), **run)
@@ -155,13 +156,16 @@ def test_growing_horizon_finds_the_period_that_the_whole_record_hides():
 def test_a_start_that_blows_up_is_backed_off_from():
     """At ks = 4e5 rk4 overflows within the record at this dt; the first stages see only what is finite."""
     scene, state = single(ks=KS * 4)
-    found = jeuler.fit_springs(scene, state, TIMES, observed(), dt=0.2, step=jeuler.euler_step, num_steps=40)
+    run = {"dt": 0.2, "step": jeuler.euler_step, "num_steps": 40, "start": "given"}
+    found = jeuler.fit_springs(scene, state, TIMES, observed(), **run)
     assert np.isfinite(found.loss)
     assert np.isfinite(found.ks)
     assert np.isfinite(found.predicted).all()
     stiff, state = single(ks=1e9)
     with pytest.raises(ValueError, match="not finite at the start.*smaller dt"):
-        jeuler.fit_springs(stiff, state, TIMES, observed(), dt=0.2)
+        jeuler.fit_springs(stiff, state, TIMES, observed(), dt=0.2, start="given")
+    found = jeuler.fit_springs(stiff, state, TIMES, observed(), dt=0.02)
+    np.testing.assert_allclose(found.ks, KS, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

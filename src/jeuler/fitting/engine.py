@@ -25,7 +25,8 @@ from jeuler.fitting.uncertainty import Uncertainty, directions, uncertainty
 from jeuler.fitting.unknowns import Layout, checked_bounds, readable
 
 PyTree = Any
-JACOBIAN_BYTES = 2**30  # a Jacobian larger than this is not formed
+JACOBIAN_BYTES = 2**30  # a Jacobian larger than this is not formed,
+MOST_COLUMNS = 500  # nor one of more columns: a run of the model for each takes longer than conjugate gradients
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +96,7 @@ class Problem:
     weights: Any
     absolute: bool
     stages: tuple[Any, ...]
+    closes_over_traced: bool = False
 
     @classmethod
     def of(
@@ -116,7 +118,7 @@ class Problem:
         with_data = data is not None
         if with_data:
             residual, data = arrays_only(residual, data)
-        form = residual_layout(residual, params, data, with_data)
+        form, closes_over_traced = residual_layout(residual, params, data, with_data)
         if not form.size or not layout.size:
             raise ValueError(
                 f"residual and params must not be empty, got {form.size} residuals and {layout.size} parameters"
@@ -124,7 +126,7 @@ class Problem:
         weight = residual_weights(form, sigma, weights)
         masks = tuple(_stage(form, stage, weight) for stage in stages)
         flat = FlatResidual(residual, layout, with_data)
-        return cls(flat, form, data, x, lower, upper, weight, sigma is not None, masks)
+        return cls(flat, form, data, x, lower, upper, weight, sigma is not None, masks, closes_over_traced)
 
     @property
     def layout(self) -> Layout:
@@ -134,7 +136,7 @@ class Problem:
     def traced(self) -> bool:
         """Whether any part of it is being traced."""
         parts = (self.data, self.x, self.lower, self.upper, self.weights, self.stages)
-        return any(map(checks.is_traced, jax.tree.leaves(parts)))
+        return self.closes_over_traced or any(map(checks.is_traced, jax.tree.leaves(parts)))
 
     @property
     def precision(self) -> float:
@@ -172,7 +174,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
     evaluate, task = programs(problem.residual), problem.task(options.tolerance)
     x = np.asarray(problem.x, float)
     m, n = problem.form.size, len(x)
-    small = m * n * 8 <= JACOBIAN_BYTES
+    small = m * n * 8 <= JACOBIAN_BYTES and n <= MOST_COLUMNS
     if not small and options.optimizer is None:
         from jeuler.fitting.matrix_free import run_matrix_free
 
@@ -252,7 +254,7 @@ def _by_optax(problem, options, evaluate, task, x, scale, watch, known) -> Outco
     )
     if not history or not np.isfinite(min(history)):
         raise ValueError(NOT_FINITE)
-    small = problem.form.size * len(x) * 8 <= JACOBIAN_BYTES
+    small = problem.form.size * len(x) * 8 <= JACOBIAN_BYTES and len(x) <= MOST_COLUMNS
     state = least_squares.start(best, problem.form.size, 1)
     if small:
         with np.errstate(all="ignore"):

@@ -20,7 +20,7 @@ STATE_PARAMETERS = ("mass", "velocity", "position", "anchors")
 WHERE = "where"  # the name of what a function of the scene picks
 
 
-def _owners(scene: Scene, name: str) -> tuple[list[int], str]:
+def owners_of(scene: Scene, name: str) -> tuple[list[int], str]:
     """Which forces a name speaks of, and its field: "ks" of the springs first, "forces[1].ks" of one force."""
     one = re.fullmatch(r"forces\[(\d+)\]\.(\w+)", name)
     field = one.group(2) if one else name
@@ -72,7 +72,7 @@ class Places:
         """The starting values by name."""
         start: dict[str, Any] = {}
         for name in self.names:
-            owners, field = _owners(scene, name)
+            owners, field = owners_of(scene, name)
             if owners:
                 values = tuple(jnp.asarray(getattr(scene.forces[k], field), state.position.dtype) for k in owners)
                 start[name] = values if len(values) > 1 else values[0]
@@ -110,7 +110,7 @@ class Places:
         """No value may have two names: "ks" and "forces[0].ks"."""
         seen: dict[tuple[int, str], str] = {}
         for name in self.names:
-            owners, field = _owners(scene, name)
+            owners, field = owners_of(scene, name)
             for owner in owners:
                 if (owner, field) in seen:
                     raise ValueError(
@@ -129,7 +129,7 @@ class Places:
             forces = list(scene.forces)
         for name in self.names:
             value = params[name]
-            owners, field = _owners(scene, name)
+            owners, field = owners_of(scene, name)
             for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
                 forces[k] = replace(forces[k], **{field: x})
             if not owners and name == "mass" and not value.ndim:
@@ -143,7 +143,7 @@ class Places:
         """Which of the parameters must not be negative."""
         found = {}
         for name in self.names:
-            owners, field = _owners(scene, name)
+            owners, field = owners_of(scene, name)
             found[name] = name == "mass" or (bool(owners) and parameters_of(scene.forces[owners[0]])[field])
         return found | ({WHERE: False} if self.where is not None else {})
 

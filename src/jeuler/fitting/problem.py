@@ -46,8 +46,8 @@ def programs(residual: FlatResidual) -> Evaluate:
     return kept_programs(residual) if residual.with_data else evaluations(residual, compiled=True)
 
 
-def residual_layout(residual: Callable, params: PyTree, data: Any, with_data: bool) -> Layout:
-    """The form of what the residual returns, or one ValueError that says what is wrong with it."""
+def residual_layout(residual: Callable, params: PyTree, data: Any, with_data: bool) -> tuple[Layout, bool]:
+    """The form of what the residual returns, and whether it closes over something traced; or one ValueError."""
     checks.function(
         "residual",
         residual,
@@ -57,14 +57,14 @@ def residual_layout(residual: Callable, params: PyTree, data: Any, with_data: bo
     layout = Layout.of(params)
     flat = jax.ShapeDtypeStruct((layout.size,), layout.dtype)
     if with_data:
-        form = jax.eval_shape(lambda x, data: residual(layout.params(x), data), flat, data)
+        program, form = jax.make_jaxpr(lambda x, data: residual(layout.params(x), data), return_shape=True)(flat, data)
     else:
-        form = jax.eval_shape(lambda x: residual(layout.params(x)), flat)
+        program, form = jax.make_jaxpr(lambda x: residual(layout.params(x)), return_shape=True)(flat)
     leaves = jax.tree.leaves(form)
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(f"residual must return real floating arrays, got {leaf.dtype}; convert what it returns")
-    return Layout.of(form)
+    return Layout.of(form), any(map(checks.is_traced, program.consts))
 
 
 def series_of(layout: Layout) -> tuple[tuple[int, int], ...]:

@@ -24,6 +24,7 @@ from jeuler.fitting.parameters import Places
 from jeuler.fitting.prediction import Prediction, compiled_positions, recording
 from jeuler.fitting.result import Fit
 from jeuler.fitting.step_bias import bias_of_step
+from jeuler.fitting.weak_form import weak_form
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step
@@ -155,12 +156,19 @@ class Recorded:
         best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
         if _good(best.fit) or options.optimizer is not None:
             return best, "data"
-        other = run(given, dataclasses.replace(options, resume=None), scale=scale, known=known)
+        try:
+            other = run(given, dataclasses.replace(options, resume=None), scale=scale, known=known)
+        except ValueError:  # not finite at the given values: nothing to set against the other
+            return best, "data"
         return (other, "given") if other.fit.loss < best.fit.loss * (1 - 1e-6) else (best, "data")
 
     def _from_data(self, given: Problem) -> Problem | None:
         """The same problem from what the weak form finds in the positions."""
-        return None
+        found = weak_form(self.scene, self.state, self.times, self.targets, self.prediction.places, self.start)
+        if found is None:
+            return None
+        x = np.clip(np.asarray(given.layout.vector(found.params), float), given.lower, given.upper)
+        return dataclasses.replace(given, x=x)
 
     def _stages(self) -> tuple[np.ndarray, ...]:
         """Masks of the residual for a growing horizon."""
@@ -211,4 +219,4 @@ def _good(found: Fit) -> bool:
         return False
     if found.noise_ratio is not None and found.noise_ratio <= GOOD:
         return True
-    return found.explained is not None and found.explained > 0.999
+    return found.explained is not None and found.explained > 0.99

@@ -67,9 +67,7 @@ def directions(jacobian: Any, precision: float) -> Directions:
     """
     xp = namespace(jacobian)
     norms = column_norms(jacobian)
-    silent = norms <= 1e3 * precision * xp.max(norms, initial=0) * 1e-6
-    scaled = jacobian / xp.where(norms > 0, norms, 1)
-    q, triangle = xp.linalg.qr(xp.where(silent, 0, scaled))
+    q, triangle = xp.linalg.qr(jacobian / xp.where(norms > 0, norms, 1))
     u, values, vt = xp.linalg.svd(triangle, full_matrices=False)
     seen = values > 2e3 * precision * xp.max(values, initial=0)
     return Directions(xp.where(norms > 0, norms, 1), values, vt.T, seen, q @ u)

@@ -84,7 +84,7 @@ class Layout:
 
     def spread(self, name: str, prefix: PyTree, default: float) -> Any:
         """A value for each number, from a tree of values whose structure begins that of the params."""
-        if checks.is_traced(prefix) or not isinstance(prefix, (dict, list, tuple)) or jax.tree.leaves(prefix) == []:
+        if not isinstance(prefix, (dict, list, tuple)) or not prefix:
             values = [default if prefix is None else prefix] * len(self.shapes)
         else:
             values = self._leafwise(name, prefix, default)

@@ -1,0 +1,83 @@
+"""Tracks as smooth curves: splines at the level of the noise, and where they can be trusted."""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from jeuler.fitting.observations import noise_of
+
+FINER = 4  # points of the fine grid in the time between two samples
+FEWEST = 9  # samples of a track
+
+
+class Tracks(NamedTuple):
+    """Positions and velocities of all particles on a fine grid.
+
+    Attributes:
+      times: of the grid, equally spaced, (fine,), s.
+      position, velocity: (fine, particle, dim), m and m/s; 0 where a particle is not known.
+      known: whether a particle is known there, (fine, particle).
+      spacing: the time between two samples, s.
+    """
+
+    times: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    known: np.ndarray
+    spacing: float
+
+
+def smoothed(times: np.ndarray, targets: np.ndarray) -> Tracks | None:
+    """Smoothing splines of fifth degree through (time, particle, dim) data; None where there are too few samples."""
+    from scipy.interpolate import splev, splrep
+
+    distinct = np.concatenate([[True], np.diff(times) > 0])
+    times, targets = times[distinct], targets[distinct]
+    if len(times) < FEWEST:
+        return None
+    spacing = float(np.median(np.diff(times)))
+    count = int(np.clip((times[-1] - times[0]) / spacing, 8, 20_000)) * FINER + 1
+    grid = np.linspace(times[0], times[-1], count)
+    shape = (count, *targets.shape[1:])
+    position, velocity = np.zeros(shape), np.zeros(shape)
+    known = np.zeros(shape[:2], bool)
+    complete = np.isfinite(targets).all(axis=2)
+    for particle in range(shape[1]):
+        seen = complete[:, particle]
+        if seen.sum() < FEWEST:
+            continue
+        t, known[:, particle] = times[seen], _near_samples(grid, times[seen], spacing)
+        for d in range(shape[2]):
+            x = targets[seen, particle, d]
+            sigma = noise_of(t, x[:, None], np.ones((len(x), 1))) or 0.0
+            sigma = max(sigma, 1e-8 * float(np.ptp(x)))
+            with warnings.catch_warnings():  # exact data cannot be met to their rounding: as good as it gets will do
+                warnings.simplefilter("ignore", RuntimeWarning)
+                curve = splrep(t, x, k=5, s=len(x) * sigma**2 * 0.9)
+            position[:, particle, d], velocity[:, particle, d] = splev(grid, curve), splev(grid, curve, der=1)
+    return Tracks(grid, position, velocity, known, spacing) if known.any() else None
+
+
+def _near_samples(grid: np.ndarray, t: np.ndarray, spacing: float) -> np.ndarray:
+    """Whether a time lies between two samples that are not far apart."""
+    k = np.clip(np.searchsorted(t, grid, side="right"), 1, len(t) - 1)
+    return (t[k] - t[k - 1] <= 3 * spacing) & (grid >= t[0]) & (grid <= t[-1])
+
+
+def bumps(grid: np.ndarray, half_width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Bumps (1 - z^2)^4 that overlap by half, their second derivatives, and where they are not 0, each (bump, fine).
+
+    Each row is multiplied by the step of the grid, so that a product with it is an integral.
+    """
+    step = grid[1] - grid[0]
+    first, last = grid[0] + half_width, grid[-1] - half_width
+    count = int(np.floor((last - first) / (half_width / 2) + 1e-9)) + 1 if last >= first else 0
+    centres = np.linspace(first, last, count) if count > 1 else np.array([(first + last) / 2] * count)
+    z = (grid[None, :] - centres[:, None]) / half_width
+    inside = np.abs(z) < 1
+    c = np.where(inside, 1 - z**2, 0)
+    second = (48 * z**2 * c**2 - 8 * c**3) / half_width**2
+    return c**4 * step, second * step, inside
