@@ -94,6 +94,12 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
     rms = float(np.sqrt(np.nanmean(residual**2)))
     share = rms / spread if spread else 0.0
     lag = lag_one(residual)
+    far = _far(residual)
+    if far.size and share > LARGE_RESIDUAL / 20:
+        yield (
+            f"{far.size} rows lie far from the model, the first at {measured.times[far[0]]:.4g} s: a knock, a lost "
+            f"point or a damaged cell; look there, and cut it out or empty the cells."
+        )
     if share > 0.5:
         yield (
             f"The model explains {max(0.0, 100 * (1 - share**2)):.0f} % of the variance only: its numbers mean "
@@ -114,6 +120,14 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
                 f"The first half period fits {begin / rest:.0f} times worse than the rest: a release or a hand may be "
                 f"in it; use --from {measured.times[~early][0]:.3g}."
             )
+
+
+def _far(residual: np.ndarray) -> np.ndarray:
+    """The few rows whose residual is more than 8 times what is usual, by the median."""
+    size = np.nanmax(np.abs(residual), axis=1, initial=0, where=np.isfinite(residual))
+    usual = np.median(size[size > 0]) if (size > 0).any() else 0.0
+    far = np.flatnonzero(size > 8 * usual)
+    return far if far.size <= 0.05 * len(size) else far[:0]
 
 
 def _parameter_words(found: Estimate) -> Iterator[str]:

@@ -16,7 +16,7 @@ from jeuler.commands.selection import Measurement
 from jeuler.fitting import fit
 from jeuler.fitting.observations import horizons
 from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes, modes_of
-from jeuler.fitting.spectrum import power_spectrum, strong_lines
+from jeuler.fitting.spectrum import strong_lines
 from jeuler.particles.scene import Scene
 
 STEPS_A_PERIOD = 40
@@ -29,7 +29,8 @@ class Estimate:
     """What was found.
 
     Attributes:
-      model, params: the model and its parameters.  stderr: of the same structure, widened; inf where not determined.
+      model, params: the model and its parameters.
+      stderr: of the same structure, for residuals correlated as these are; inf where not determined.
       widening: by how much the errors for white residuals were multiplied.
       at_zero: the parameters that ended at their bound 0, in words.
       predicted: at the measured times, (time, particle, dim).  dt: step size, s.
@@ -166,15 +167,14 @@ def estimate(
         params = {k: np.where(held[k], 0.0, v) if k in held else np.asarray(v) for k, v in found.params.items()}
         stage = False
     predicted = np.asarray(jax.jit(predict)(found.params))
-    widening = 1.0 if hasattr(found, "stderr_white") else _widening(measured, predicted, guess)
     n = model.particles
-    stderr = {name: np.asarray(error) * widening for name, error in found.stderr.items()}
+    stderr = {name: np.asarray(error) for name, error in found.stderr.items()}
     scene, state = model.scene(found.params)
     return Estimate(
         model=model,
         params={name: np.where(held.get(name, False), 0.0, value) for name, value in found.params.items()},
         stderr=stderr,
-        widening=widening,
+        widening=_widening(found),
         at_zero=_held_words(model, held),
         predicted=predicted,
         dt=dt,
@@ -252,17 +252,8 @@ def _descend(
     return found, predict
 
 
-def _widening(measured: Measurement, predicted: np.ndarray, guess: Oscillation) -> float:
-    """How much larger the errors are than for white residuals: the residual's spectrum near the motion's frequency,
-    where ks and kd are read off, against its mean; its root, at least 1."""
-    widest = 1.0
-    span = float(np.ptp(measured.times))
-    residual = (measured.positions - predicted).reshape(len(measured.times), -1)
-    for column in residual.T:
-        if np.isfinite(column).sum() < 20:
-            continue
-        frequencies, power = power_spectrum(measured.times, column, span)
-        near = np.abs(frequencies / guess.angular_frequency - 1) < 0.5
-        if near.sum() >= 8 and power.mean() > 0:
-            widest = max(widest, float(np.sqrt(power[near].mean() / power.mean())))
-    return widest
+def _widening(found: Any) -> float:
+    """By how much the errors of ks are larger than for white residuals."""
+    wide, white = (np.ravel(errors["ks"]) for errors in (found.stderr, found.stderr_white))
+    known = np.isfinite(wide) & np.isfinite(white) & (white > 0)
+    return float(np.max(wide[known] / white[known])) if known.any() else 1.0

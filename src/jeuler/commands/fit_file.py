@@ -122,7 +122,7 @@ def _fit(
     scores = []
     for found in tried:
         size = sum(np.size(x) for x in found.params.values())
-        independent = samples / min(t.widening for t in tried) ** 2
+        independent = samples / max(min(t.widening for t in tried), 1.0) ** 2
         scores.append(independent * np.log(max(found.loss, 1e-300)) + size * np.log(independent))
     best = int(np.argmin(scores))
     compared = [

@@ -137,7 +137,9 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
         notes=recording.notes,
         warnings=(*recording.warnings, *warnings),
     )
-    return thinned(dataclasses.replace(measured, sampling=sampling(measured.times)))
+    clock = sampling(measured.times)
+    gaps = (f"The record has {clock.gaps} gaps, the longest of {clock.longest_gap:.3g} s.",) if clock.gaps else ()
+    return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *gaps)))
 
 
 def thinned(measured: Measurement) -> Measurement:

@@ -22,6 +22,9 @@ def read_text(source: str, text: str, skip: int = 0, notes: tuple[str, ...] = ()
         raise ValueError(f"{source}: no data, expected rows of a time and at least one value")
     layout = find_layout(source, lines, comments)
     body = lines[layout.begin :]
+    among = [number for number, _ in comments if body and number > body[0][0]]
+    if among:
+        notes = (*notes, f"{len(among)} comments among the data were left out, the first at line {among[0]}.")
     if not body:
         raise ValueError(f"{source}: line {lines[0][0]}: only names and no numbers, expected rows of numbers")
     names = named(layout.names or [""] * layout.width, "" if layout.names else "t")
