@@ -69,6 +69,7 @@ RESULTS = {
         decay, 1.0, t1=1.0, dts=[0.5, 0.25], steps={"Euler": jeuler.euler_step}, reference=np.exp, repeats=1
     ),
     "Compensated": lambda: jeuler.Compensated(jeuler.euler_step),
+    "StabilityLimit": lambda: jeuler.stability_limit(lambda t, y, args: -4.0 * y, 0.0, 1.0),
     "StepAdvice": lambda: jeuler.StepAdvice(0.01, 100, 1e-3, 2.0, 1e-7, True, "accuracy sets dt"),
     "Diagnosis": lambda: jeuler.Diagnosis(False, step=3, part="forces[0] Springs", springs=(4,), cause="it blew up"),
     "Trajectory": trajectory,

@@ -47,6 +47,7 @@ from jeuler.particles import ParticleState, Scene, empty_pool, simulate, uses
 from jeuler.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
 from jeuler.solving import AdaptiveSolution, Solution, solve, solve_adaptive
 from jeuler.steps import (
+    StabilityLimit,
     cap_cotangent,
     euler_step,
     extrapolated_euler,
@@ -100,6 +101,7 @@ __all__ = [
     "Sphere",
     "SpringFit",
     "Springs",
+    "StabilityLimit",
     "StepAdvice",
     "StrandBending",
     "StrandCore",

@@ -1,6 +1,7 @@
 """Predicted stability limits against closed forms, and against the dt at which real runs blow up."""
 
 import math
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,11 @@ import pytest
 from cases import leapfrog_step, oscillator
 
 import jeuler
+from jeuler._core.precision import double_precision
 from jeuler.steps.extrapolated import extrapolated_euler
 from jeuler.steps.implicit import implicit_euler_step, linearly_implicit_euler_step
-from jeuler.steps.stability import DENSE, stability_limit
+from jeuler.steps.reduced import Runs, reduced_pair, symmetric_weights
+from jeuler.steps.stability import DENSE, Linearisation, Spectrum, stability_limit
 
 
 def decay(t, y, rate):
@@ -129,6 +132,114 @@ def test_large_systems_agree_with_all_eigenvalues():
     field = lambda t, y, ks: ks * (jnp.roll(y, 1).at[0].set(0) - 2 * y + jnp.roll(y, -1).at[-1].set(0))  # noqa: E731
     fastest = 4 * 9.0 * math.sin(n * math.pi / (2 * (n + 1))) ** 2
     assert stability_limit(field, 0.0, jnp.ones(n), 9.0) == pytest.approx(2 / fastest, rel=1e-4)
+
+
+def test_a_long_heat_line_and_a_long_chain_have_the_closed_form_limit():
+    heat = lambda t, y, args: jnp.diff(jnp.concatenate([y[:1], y, y[-1:]]), 2)  # noqa: E731
+    assert stability_limit(heat, 0.0, jnp.zeros(1000)) == pytest.approx(0.5, rel=0.01)
+    n = 600
+    chain = np.stack([np.arange(n - 1), np.arange(1, n)], 1)
+    scene = jeuler.Scene((jeuler.Springs(chain, ks=100.0, kd=0.0, rest_length=1.0),))
+    state = jeuler.ParticleState(jnp.arange(n, dtype=float)[:, None], jnp.zeros((n, 1)))
+    limit = stability_limit(scene, state, step=jeuler.symplectic_euler_step)
+    assert limit == pytest.approx(0.1, rel=0.01)
+    assert limit.known
+    assert limit.lower < limit < limit.upper < 1.04 * limit.lower
+    assert stability_limit(scene, state) == 0.0  # undamped
+
+
+def random_net(seed, kd=None):
+    random = np.random.default_rng(seed)
+    count, dim = 5, 2 + seed % 2
+    x = random.normal(size=(count, dim))
+    edges = [(i, j) for i in range(count) for j in range(i) if j == i - 1 or random.random() < 0.4]
+    length = np.array([np.linalg.norm(x[i] - x[j]) for i, j in edges]) * (1 - 0.05 * random.random(len(edges)))
+    mass = 10 ** random.uniform(-0.5, 0.5, count)
+    mass[0] = np.inf
+    kd = 10 ** random.uniform(-2, 0.5, len(edges)) if kd is None else kd
+    scene = jeuler.Scene((jeuler.Springs(edges, ks=10 ** random.uniform(0, 2, len(edges)), kd=kd, rest_length=length),))
+    return scene, jeuler.ParticleState(jnp.asarray(x), jnp.zeros(x.shape), jnp.asarray(mass))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_prestressed_nets_of_unequal_masses_under_symplectic_euler(seed):
+    """For symmetric K and C >= 0 it is stable exactly as long as dt^2 K + 2 dt C < 4, in units of mass."""
+    scene, state = random_net(seed, kd=0.0 if seed % 3 == 0 else None)
+    size = state.position.size
+    weight = np.sqrt(np.repeat(np.where(np.isfinite(state.mass), state.mass, 1), state.position.shape[1]))
+
+    def acceleration(x, v):
+        shape = state.position.shape
+        return scene.vector_field(0.0, (x.reshape(shape), v.reshape(shape)), state.mass)[1].ravel()
+
+    at_rest = state.position.ravel(), state.velocity.ravel()
+    stiffness, damping = (-weight[:, None] * np.asarray(jax.jacfwd(acceleration, k)(*at_rest)) / weight for k in (0, 1))
+    free = np.repeat(np.isfinite(state.mass), size // len(state.mass))
+    stiffness, damping = (matrix[np.ix_(free, free)] for matrix in (stiffness, damping))
+
+    def stable(dt):
+        return np.linalg.eigvalsh(dt**2 * stiffness + 2 * dt * damping).max() < 4
+
+    low, high = 1e-4, 10.0
+    for _ in range(40):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    limit = stability_limit(scene, state, step=jeuler.symplectic_euler_step)
+    assert limit == pytest.approx(low, rel=1e-3)
+
+
+@pytest.mark.parametrize("step", [jeuler.symplectic_euler_step, jeuler.rk4_step, leapfrog_step])
+def test_a_net_in_a_part_of_its_space_has_the_limit_of_the_whole(step):
+    """The large path on a net that the small one can do too."""
+    scene, state = random_net(7)
+    y, args = scene.as_equation(state)
+    whole = stability_limit(scene, state, step=step)
+    with double_precision():
+        linear = Linearisation(scene.vector_field, y, args)
+        flat = np.asarray(linear.flat)
+        product = lambda u: np.asarray(linear.product(0.0, flat, jnp.asarray(u)))  # noqa: E731
+        small = reduced_pair(product, flat.size, symmetric_weights(product, flat.size, args.mass))
+        part = linear.limit_of(Spectrum.of(small.matrix, small.like, linear.neutral), step, "unstable")
+        checked = linear.bisected(lambda dt: dt > whole, Runs(linear.field, step, linear.y, 1.0), part, 10.0)
+    assert part == pytest.approx(whole, rel=1e-3)
+    assert checked == pytest.approx(whole, rel=0.02)
+
+
+def test_a_limit_that_runs_cannot_confirm_says_so():
+    """Damping of one mode in a thousand: growth at 1.5 % above the limit would take a million steps to show."""
+    n = 800
+    omega = jnp.linspace(1.0, 2.0, n)
+    field = lambda t, y, args: (y[1], -(omega**2) * y[0] - 2e-3 * omega * y[1])  # noqa: E731
+    with pytest.warns(UserWarning, match="not known within 2 %"):
+        limit = stability_limit(field, 0.0, (jnp.zeros(n), jnp.zeros(n)))
+    assert not limit.known
+    assert limit.lower <= limit <= limit.upper
+    assert limit == pytest.approx(1e-3, rel=0.02)  # that of the fastest mode all the same
+
+
+def test_growth_by_nature_has_a_decaying_twin_that_no_step_is_to_blame_for():
+    field = lambda t, y, args: (y[1], jnp.array([4.0, -100.0]) * y[0])  # noqa: E731
+    y = jnp.array([1e-3, 1.0]), jnp.zeros(2)
+    step = jeuler.symplectic_euler_step
+    assert stability_limit(field, 0.0, y, step=step, growing="skip") == pytest.approx(0.2, rel=1e-3)
+    assert stability_limit(field, 0.0, y, step=step) == 0.0
+
+
+def test_a_scene_and_its_state_stand_for_field_and_arguments():
+    scene, state = random_net(3)
+    expected = stability_limit(scene.vector_field, 0.5, (state.position, state.velocity), state.mass)
+    assert stability_limit(scene, state) == stability_limit(scene, 0.5, state) == expected > 0
+    with pytest.raises(ValueError, match="state must be a ParticleState"):
+        stability_limit(scene, 0.0, (state.position, state.velocity))
+    with pytest.raises(ValueError, match="y must be the state at time t"):
+        stability_limit(scene.vector_field, 0.0)
+
+
+def test_a_limit_is_a_float_that_survives_copies():
+    limit = stability_limit(decay, 0.0, 1.0, 50.0)
+    again = pickle.loads(pickle.dumps(limit))
+    assert isinstance(limit, float)
+    assert (again, again.known, again.reason) == (limit, True, "all eigenvalues")
 
 
 def test_growth_of_the_equation_is_unstable_or_left_out():

@@ -11,7 +11,7 @@ from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.component import as_component, component
 from jeuler.particles.equation import Attributes, Equation
-from jeuler.particles.fields import declared, name_of
+from jeuler.particles.fields import declared, name_of, with_required_fields
 from jeuler.particles.protocols import Context
 from jeuler.particles.state import ParticleState
 
@@ -85,6 +85,17 @@ class Scene:
         others = {name: getattr(state, name) for name in sorted(names)}
         mass = state.mass if state.alive is None else jnp.where(state.alive, state.mass, jnp.inf)
         return Attributes(mass, state.alive, others or None)
+
+    def as_equation(self, state: ParticleState) -> tuple[tuple[Array, Array], Attributes]:
+        """What `solve` takes with `vector_field` to move this state: the pair (y0, args).
+
+        y0 = (position, velocity)
+        """
+        checks.kind("state", state, ParticleState)
+        state.check()
+        state = with_required_fields(state, self.forces, self.effects)
+        self.check(state)
+        return (state.position, state.velocity), self.attributes(state)
 
     def energy(self, t: Any, y: tuple[Array, Array], mass: Any) -> Array:
         """Kinetic and potential energy of the particles that can move, J; of the forces that have a potential.

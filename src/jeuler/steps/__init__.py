@@ -8,9 +8,10 @@ from jeuler.steps.implicit import (
     linearly_implicit_euler,
     linearly_implicit_euler_step,
 )
-from jeuler.steps.stability import stability_limit
+from jeuler.steps.stability import StabilityLimit, stability_limit
 
 __all__ = [
+    "StabilityLimit",
     "cap_cotangent",
     "euler_step",
     "extrapolated_euler",

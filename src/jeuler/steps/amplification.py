@@ -24,27 +24,9 @@ def amplification(step: Step, z: jax.Array) -> jax.Array:
     return jnp.hypot(image[0], image[1])
 
 
-def pair_amplification(step: Step, stiffness: jax.Array, damping: jax.Array) -> jax.Array:
-    """Spectral radius of one step of size 1 on x'' = -k x - c x'."""
-
-    def field(t, y, args):
-        return y[1], -stiffness * y[0] - damping * y[1]
-
-    (a, c), (b, d) = (step(field, 0.0, start, 1.0, None) for start in _unit_pairs())
-    mean, determinant = (a + d) / 2, a * d - b * c
-    square = mean**2 - determinant
-    return jnp.where(square > 0, jnp.abs(mean) + jnp.sqrt(jnp.maximum(square, 0)), jnp.sqrt(jnp.abs(determinant)))
-
-
 @functools.partial(jax.jit, static_argnames="step")
 def _scalar_gain(step, unit, s):
     return jax.vmap(jax.vmap(lambda z: amplification(step, z)))(unit[:, None] * s)
-
-
-@functools.partial(jax.jit, static_argnames="step")
-def _pair_gain(step, stiffness, damping, s):
-    gain = jax.vmap(jax.vmap(lambda k, c: pair_amplification(step, k, c)))
-    return gain(stiffness[:, None] * s**2, damping[:, None] * s)
 
 
 def _unit_pairs():
@@ -52,10 +34,13 @@ def _unit_pairs():
     return (one, zero), (zero, one)
 
 
-@functools.lru_cache(maxsize=64)
 def treats_all_alike(step: Any) -> bool:
     """Whether the step commutes with a linear change of variables, so that eigenvalues say all about it."""
+    return _treats_all_alike(step)
 
+
+@functools.lru_cache(maxsize=64)
+def _treats_all_alike(step: Any) -> bool:
     @jax.jit
     def image(matrix):
         def field(t, y, args):
@@ -74,13 +59,6 @@ def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> 
     """The largest stable dt of each eigenvalue, Re <= 0."""
     size = np.abs(rates)
     return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
-
-
-def pair_limits(step: Step, stiffness: np.ndarray, damping: np.ndarray, interval: float = math.inf) -> np.ndarray:
-    """The largest stable dt of each mode x'' = -k x - c x'."""
-    size = np.sqrt(np.abs(stiffness)) + np.abs(damping)
-    gain = functools.partial(_pair_gain, step, stiffness / size**2, damping / size)
-    return largest_stable(gain, 1 / (size * interval)) / size
 
 
 def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
