@@ -75,7 +75,7 @@ def _add_model(job: argparse.ArgumentParser) -> None:
     """Options that say what is fitted."""
     add = job.add_argument
     add("--mass", help="mass of the particles in kg, one number or one each: 0.2,0.3; ? to be found (default 1)")
-    add("--dt", type=float, help="step size of the simulation in s (default: a 40th of a period)")
+    add("--dt", type=float, help="step size of the simulation in s (default: an 80th of a period)")
     add("--edges", help="springs: 1-2 between particles 1 and 2, 1-anchor to a fixed point (default: an anchor each)")
     add("--start", help="where the search starts: ks=20,kd=0.3 (default: read off the data)")
     add("--friction", help="viscous, quadratic, dry, several joined by +, or compare (default viscous)")

@@ -27,6 +27,7 @@ def cautions(measured: Measurement, found: Estimate, guess: Oscillation, mass_gi
     told += _motion_words(measured, found, guess)
     told += _residual_words(measured, found, guess)
     told += _parameter_words(found)
+    told += _step_words(found)
     return told
 
 
@@ -100,7 +101,7 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
             f"{far.size} rows lie far from the model, the first at {measured.times[far[0]]:.4g} s: a knock, a lost "
             f"point or a damaged cell; look there, and cut it out or empty the cells."
         )
-    if share > 0.5:
+    if share > 0.7:
         yield (
             f"The model explains {max(0.0, 100 * (1 - share**2)):.0f} % of the variance only: its numbers mean "
             f"nothing. Look at the picture and at `jeuler look`; choose columns, run or span."
@@ -138,6 +139,20 @@ def _parameter_words(found: Estimate) -> Iterator[str]:
         yield "A stiffness came out negative: the model is wrong for these data; look at the columns and --edges."
     for what in found.at_zero:
         yield f"The best {what} would be negative; it is held at 0: the data show none, or the model lacks a drive."
+
+
+def _step_words(found: Estimate) -> Iterator[str]:
+    """The damping of the fourth-order Runge-Kutta step itself, omega (omega dt)^5 / 144, against the error of kd."""
+    if "kd" not in found.params or found.model.places:
+        return
+    omega = max(mode.angular_frequency for mode in found.modes)
+    bias = 2 * float(np.max(found.mass)) * omega * (omega * found.dt) ** 5 / 144
+    kd, errors = np.atleast_1d(found.params["kd"]), np.atleast_1d(found.stderr["kd"])
+    if bias > max(float(np.min(errors)), 1e-3 * float(np.min(np.abs(kd)))):
+        yield (
+            f"The step of {found.dt:.3g} s damps the model by itself: kd is too small by {bias:.2g}; "
+            f"give --dt {found.dt / 2:.3g}."
+        )
 
 
 def lag_one(residual: np.ndarray) -> float:

@@ -19,7 +19,8 @@ from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, 
 from jeuler.fitting.spectrum import strong_lines
 from jeuler.particles.scene import Scene
 
-STEPS_A_PERIOD = 40
+STEPS_A_PERIOD, FEWER_STEPS = 80, 40  # the second where the first would be more than MANY_STEPS
+MANY_STEPS = 100_000
 MOST_STEPS = 1_000_000
 NOT_NEGATIVE = ("kd", "quadratic", "dry")
 
@@ -73,13 +74,14 @@ def guess_of(measured: Measurement) -> Oscillation:
 
 
 def step_size(measured: Measurement, guess: Oscillation, asked: float | None) -> float:
-    """A 40th of the shortest period, a 100th of the record at most."""
+    """An 80th of the shortest period, a 40th in a very long record, a 100th of the record at most."""
     flat = measured.positions.reshape(len(measured.times), -1)
     lines = [omega for column in flat.T for omega, _ in strong_lines(measured.times, column)]
     period = 2 * np.pi / max([guess.angular_frequency, *(o for o in lines if o < 8 * guess.angular_frequency)])
     span = float(np.ptp(measured.times))
     if asked is None:
-        return min(period / STEPS_A_PERIOD, span / 100)
+        steps = STEPS_A_PERIOD if span / period * STEPS_A_PERIOD <= MANY_STEPS else FEWER_STEPS
+        return min(period / steps, span / 100)
     if asked > period / 10:
         raise ValueError(f"--dt {asked:g}: must be below a tenth of the period of {period:.3g} s; leave it out")
     if span / asked > MOST_STEPS:
