@@ -23,6 +23,7 @@ from jeuler.fitting.observations import (
 from jeuler.fitting.parameters import Places
 from jeuler.fitting.prediction import Prediction, compiled_positions, recording
 from jeuler.fitting.result import Fit
+from jeuler.fitting.sampling import aliased
 from jeuler.fitting.step_bias import bias_of_step
 from jeuler.fitting.weak_form import weak_form
 from jeuler.particles.scene import Scene
@@ -207,9 +208,11 @@ class Recorded:
         if self.traced:
             return fields, None, scene, state, self.prediction.positions(found.params, data)
         predicted = compiled_positions(self.prediction)(found.params, data)
+        words = aliased(self.scene, scene, state, self.times)
         if step_bias and found.covariance is not None and outcome.state is not None:
-            bias, words = bias_of_step(self, found, outcome.state)
-            fields["message"] = "; ".join([fields["message"], *words])
+            bias, more = bias_of_step(self, found, outcome.state)
+            words = [*words, *more]
+        fields["message"] = "; ".join([fields["message"], *words])
         return fields, bias, scene, state, predicted
 
 
