@@ -24,7 +24,16 @@ from jeuler.effects import (
     SampledPath,
     SpeedLimit,
 )
-from jeuler.fitting import Fit, SpringFit, Trajectory, fit, fit_springs, read_trajectory
+from jeuler.fitting import (
+    Fit,
+    Identifiability,
+    SpringFit,
+    Trajectory,
+    fit,
+    fit_springs,
+    identifiability,
+    read_trajectory,
+)
 from jeuler.forces import (
     Bending,
     Gravity,
@@ -83,6 +92,7 @@ __all__ = [
     "FromSurface",
     "Gravity",
     "Gust",
+    "Identifiability",
     "Lifetime",
     "LinearDrag",
     "Normal",
@@ -121,6 +131,7 @@ __all__ = [
     "fit",
     "fit_springs",
     "heun_step",
+    "identifiability",
     "implicit_euler",
     "implicit_euler_step",
     "linearly_implicit_euler",

@@ -3,14 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fitting.test_springs import solve_tight
 from scipy.spatial import Delaunay
 
 import jeuler
 from jeuler.fitting.nonnegative import nonnegative_least_squares
 from jeuler.fitting.parameters import Places
 from jeuler.fitting.weak_form import weak_form
-
-from fitting.test_springs import solve_tight
 
 
 def mesh(random, particles=12):

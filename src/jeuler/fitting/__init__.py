@@ -1,16 +1,19 @@
 """Fitting: parameters of a simulation from what was measured, by gradient."""
 
 from jeuler.fitting._fit import fit
+from jeuler.fitting._identifiability import Identifiability, identifiability
 from jeuler.fitting._springs import SpringFit, fit_springs
 from jeuler.fitting.result import Fit
 from jeuler.fitting.trajectory import Trajectory, read_trajectory
 
 __all__ = [
     "Fit",
+    "Identifiability",
     "SpringFit",
     "Trajectory",
     "fit",
     "fit_springs",
+    "identifiability",
     "read_trajectory",
 ]
 

@@ -12,6 +12,7 @@ from jeuler._core.component import result
 from jeuler.fitting._tables import fit_table
 from jeuler.fitting.engine import Options
 from jeuler.fitting.parameters import values_of_springs
+from jeuler.fitting.profiles import again_of, keep
 from jeuler.fitting.recorded import Recorded
 from jeuler.fitting.result import Fit, as_pytree
 from jeuler.particles.scene import Scene
@@ -81,6 +82,7 @@ class SpringFit:
 
     _repr_html_ = fit_table
     correlation = Fit.correlation
+    profile = Fit.profile
 
 
 as_pytree(SpringFit, ("message", "undetermined", "blind", "at_bound", "start"))
@@ -187,7 +189,7 @@ def fit_springs(
     )
     found, begun = task.fit(options, bounds, sigma, weights, start, grow)
     fields, bias, fitted_scene, fitted_state, predicted = task.completed(found, step_bias)
-    return SpringFit(
+    complete = SpringFit(
         ks=values_of_springs(fitted_scene, "ks"),
         kd=values_of_springs(fitted_scene, "kd"),
         scene=fitted_scene,
@@ -197,3 +199,5 @@ def fit_springs(
         start=begun,
         **fields,
     )
+    keep(complete, again_of(found.fit))
+    return complete

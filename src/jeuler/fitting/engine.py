@@ -20,6 +20,7 @@ from jeuler.fitting.least_squares import State, Task
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import TUNING, Watch, descend, many_starts, search
 from jeuler.fitting.problem import FlatResidual, programs, residual_layout, residual_weights, series_of
+from jeuler.fitting.profiles import Again, keep
 from jeuler.fitting.result import Fit, Verdict
 from jeuler.fitting.uncertainty import Uncertainty, directions, uncertainty
 from jeuler.fitting.unknowns import Layout, checked_bounds, readable
@@ -205,7 +206,11 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
     if not np.isfinite(state.cost):
         raise ValueError(NOT_FINITE)
     words = ending(state, watch)
-    return Outcome(report(problem, state, found.history, found.spread, options.loss, words, known, starts), state)
+    fit = report(problem, state, found.history, found.spread, options.loss, words, known, starts)
+    if fit.stderr is not None:
+        task = task._replace(spread=np.asarray(found.spread))
+        keep(fit, _again(problem, evaluate, options.loss, task, state, fit))
+    return Outcome(fit, state)
 
 
 NOT_FINITE = (
@@ -234,6 +239,14 @@ def ending(state: State, watch: Watch | None = None) -> str:
             "it jumps or is not finite near here, so use a smaller dt or start elsewhere"
         )
     return "stopped before it converged: allow more iterations or start closer"
+
+
+def _again(problem: Problem, evaluate: Any, loss: str, task: Task, state: State, fit: Fit) -> Again:
+    """What a profile needs of this fit."""
+    error, white = (np.asarray(problem.layout.vector(e), float) for e in (fit.stderr, fit.stderr_white))
+    freedom = max(int(np.sum(task.all_weights > 0)) - len(state.x), 1)
+    variance = 1.0 if problem.absolute else float(np.sum(np.asarray(state.residual) ** 2)) / freedom
+    return Again(problem.layout, evaluate, LOSSES[loss], task, state, error, white, max(variance, 1e-300))
 
 
 def _by_optax(problem, options, evaluate, task, x, scale, watch, known) -> Outcome:
@@ -354,7 +367,7 @@ def report(
         undetermined = tuple(name for name, out in zip(names, found.blind, strict=True) if out)
         with np.errstate(all="ignore"):
             seen = directions(state.jacobian, problem.precision)
-            blind = describe_blind(_null(seen), x, words_of, np.asarray(problem.lower) >= 0)
+            blind = describe_blind(null_directions(seen), x, words_of, np.asarray(problem.lower) >= 0)
         doubtful = (problem.lower == 0) & (x > 0) & (error > x) & ~found.blind
         unresolved = tuple(np.asarray(words_of)[doubtful])
     at_bound = ((x <= problem.lower) & (problem.lower < problem.upper)) | (
@@ -405,7 +418,7 @@ def _kept(layout: Layout) -> tuple[str, ...]:
     return (f"{', '.join(layout.kept)} kept as given, an integer; write a float to fit it",)
 
 
-def _null(seen: Any) -> np.ndarray:
+def null_directions(seen: Any) -> np.ndarray:
     """Directions of the parameters that change nothing, (n, k)."""
     vectors = seen.vectors[:, seen.seen]
     _, _, vt = np.linalg.svd(vectors.T, full_matrices=True)

@@ -9,7 +9,9 @@ import jax
 import numpy as np
 
 from jeuler._core.component import result
+from jeuler.fitting import profiles
 from jeuler.fitting._tables import fit_table
+from jeuler.fitting.profiles import Profile
 
 PyTree = Any
 
@@ -67,6 +69,33 @@ class Fit:
     starts: Any = None
 
     _repr_html_ = fit_table
+
+    def profile(self, name: str, *, level: float = 0.95) -> Profile:
+        """The profile-likelihood interval of one parameter: how far it can go when all others follow.
+
+        (loss(p_k) - loss) / variance = z^2,   z = 1.96 for 95 %, times how much correlated residuals widen errors
+
+        Args:
+          name: of the parameter: "k", or "ks[3]" for one number of an array.
+          level: probability of the interval.
+        Returns: `Profile`, with ``.lower`` and ``.upper``; infinite, or the bound, where nothing stops it.
+        Raises: ValueError, if there is no such parameter, or the fit was copied, traced or has no errors.
+        Example:
+          >>> import jax.numpy as jnp, jeuler
+          >>> x = jnp.linspace(0.0, 1.0, 11)
+          >>> found = jeuler.fit(lambda p: p["a"] * x - 3 * x - 0.1 * jnp.sin(40 * x), {"a": 1.0})
+          >>> interval = found.profile("a")
+          >>> bool(interval.lower < found.params["a"] < interval.upper)
+          True
+        """
+        from scipy.stats import norm
+
+        if not 0 < level < 1:
+            raise ValueError(f"level must lie between 0 and 1, got {level!r}")
+        again = profiles.again_of(self)
+        if again is None:
+            raise ValueError("a profile needs the fit as `fit` gave it, with standard errors; fit again")
+        return again.profile(name, float(norm.ppf((1 + level) / 2)))
 
     @property
     def correlation(self) -> Any:

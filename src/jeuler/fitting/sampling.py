@@ -38,16 +38,16 @@ def aliased(given: Scene, fitted: Scene, state: ParticleState, times: np.ndarray
 
 
 def _slowest(scene: Scene, state: ParticleState, limit: float) -> float | None:
-    """The angular frequency of the slowest mode if that is above a limit, rad/s; None too where there are many modes."""
+    """The angular frequency of the slowest mode if that is above a limit, rad/s; None where there are many modes."""
     mass = np.broadcast_to(np.asarray(state.mass, float), state.position.shape[:1])
     moving = int(np.isfinite(mass).sum()) * state.position.shape[1]
-    if not 0 < moving <= MOST_MODES or _fastest(scene, mass) < limit:
+    if not 0 < moving <= MOST_MODES or fastest(scene, mass) < limit:
         return None
     found = [mode.angular_frequency for mode in modes(scene, state) if mode.angular_frequency > 0]
     return min(found) if found and min(found) > limit else None
 
 
-def _fastest(scene: Scene, mass: np.ndarray) -> float:
+def fastest(scene: Scene, mass: np.ndarray) -> float:
     """A bound on the angular frequencies by the springs, rad/s: omega^2 <= 2 sum of ks / m at the stiffest particle."""
     total = np.zeros(len(mass))
     for force in scene.forces:
