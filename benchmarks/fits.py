@@ -112,7 +112,7 @@ def coverage(repeats=500):
 
 
 def starts(cases=100):
-    """Oscillators of any ks, mass and damping, starts wrong by up to 100, a third of them aliased: right, said, silent."""
+    """Oscillators of any ks, mass, damping; starts wrong by up to 100, a third aliased: right, said, or silent."""
     random, counted = np.random.default_rng(7), collections.Counter()
     for case in range(cases):
         ks, mass = 10 ** random.uniform(0, 3), 10 ** random.uniform(-1, 1)
