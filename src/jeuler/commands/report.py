@@ -162,7 +162,7 @@ def lines(told: dict[str, Any], picture: str | None, example: bool) -> list[str]
         omega = mode["natural_frequency"]
         hertz = omega / (2 * np.pi)
         text.append(f"  {'natural frequency':<24} {omega:.5g} rad/s = {hertz:.4g} Hz (squared {omega**2:.4g} 1/s^2)")
-        text.append(f"  {'damping ratio':<24} {mode['damping_ratio']:.4g}")
+        text.append(f"  {'damping ratio':<24} {mode['damping_ratio'] + 0.0:.4g}")
     if told["equation"]:
         text.append(f"  {'equation':<24} {told['equation']}")
     unit = told["unit"]
