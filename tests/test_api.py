@@ -1,6 +1,7 @@
 """Completeness: every public name is documented, in the README, in the tables; importing stays light."""
 
 import importlib
+import importlib.util
 import inspect
 import pathlib
 import re
@@ -14,6 +15,7 @@ import jeuler
 import jeuler.plotting
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+SOURCE = ROOT / "src" / "jeuler"
 
 
 @pytest.mark.parametrize("name", jeuler.__all__)
@@ -22,8 +24,10 @@ def test_public_name_has_a_full_docstring(name):
     assert doc
     assert doc.splitlines()[0].endswith((".", ":"))
     gives_back = "Attributes:" in doc  # a class of results, which nobody makes
-    for section in ("Example:", ">>>") if gives_back else ("Args:", "Raises:", "Example:", ">>>", "Source:"):
+    for section in ("Example:", ">>>") if gives_back else ("Args:", "Example:", ">>>"):
         assert section in doc, section
+    for section in ("Raises:", "Source:"):  # where there is something to say, and never to say that there is nothing
+        assert not re.search(rf"{section}\s*(nothing|none|\.|$)", doc, flags=re.MULTILINE | re.IGNORECASE)
     assert "Returns:" in doc or not inspect.isfunction(getattr(jeuler, name))
 
 
@@ -72,3 +76,36 @@ def test_import_brings_jax_and_nothing_heavier():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "package", ["forces", "effects", "contact", "samplers", "steps", "fitting", "accuracy", "solving"]
+)
+def test_a_namespace_shows_just_its_public_names(package):
+    module = importlib.import_module(f"jeuler.{package}")
+    assert dir(module) == sorted(module.__all__)
+    assert all(hasattr(module, name) for name in module.__all__)
+
+
+@pytest.mark.parametrize("package", ["forces", "effects", "contact", "samplers", "steps"])
+def test_a_catalogue_is_an_attribute_of_the_package_and_its_names_are_public(package):
+    module = getattr(jeuler, package)
+    assert inspect.ismodule(module)
+    assert set(module.__all__) <= set(jeuler.__all__)
+    assert all(getattr(module, name) is getattr(jeuler, name) for name in module.__all__)
+
+
+def modules():
+    names = [path.relative_to(SOURCE).with_suffix("").parts for path in SOURCE.rglob("*.py")]
+    return [parts[:-1] if parts[-1] == "__init__" else parts for parts in names]
+
+
+def test_no_module_shares_its_name_with_a_public_function():
+    functions = {name for name in jeuler.__all__ if callable(getattr(jeuler, name))} | set(jeuler.plotting.__all__)
+    assert not functions & {parts[-1] for parts in modules() if parts}
+    assert callable(jeuler.solve)
+    assert importlib.util.find_spec("jeuler.solve") is None
+
+
+def test_two_files_stand_at_the_top_of_the_package():
+    assert sorted(path.name for path in SOURCE.glob("*.py")) == ["__init__.py", "__main__.py"]

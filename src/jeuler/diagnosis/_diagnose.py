@@ -99,8 +99,6 @@ def diagnose(
       >>> state = jeuler.ParticleState(jnp.array([[0.0], [1.1]]), jnp.zeros((2, 1)))
       >>> print(jeuler.diagnose(scene, state, dt=0.5, num_steps=1000))
       the value is lost in step ...: dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
-
-    Source: A. Witkin, D. Baraff, Physically Based Modeling, SIGGRAPH course notes, 1997, sect. 3.
     """
     for name, tree in (("state", state), ("scene", scene)):
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):

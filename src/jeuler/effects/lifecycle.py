@@ -243,16 +243,12 @@ class Death:
     Args:
       condition: a function ``condition(t, state) -> (particle,)`` boolean. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state without the particles for which it holds.
-    Raises: nothing of its own.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> too_hot = jeuler.Death(lambda t, state: state.temperature > 100.0)
       >>> state = jeuler.ParticleState(jnp.zeros((2, 1)), jnp.zeros((2, 1)), extra={"temperature": [20.0, 120.0]})
       >>> jeuler.simulate(jeuler.Scene(effects=(too_hot,)), state, dt=0.1, num_steps=1).y.alive[-1].tolist()
       [True, False]
-
-    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
-      sect. 2 (particle extinction).
     """
 
     condition: Callable[[Any, Any], Array]
@@ -280,9 +276,6 @@ class DeathOutside:
       >>> state = jeuler.ParticleState(jnp.array([[0.0, 0.0], [0.0, 2.0]]), jnp.zeros((2, 2)))
       >>> jeuler.simulate(scene, state, dt=0.1, num_steps=1).y.alive[-1].tolist()
       [True, False]
-
-    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
-      sect. 2 (particle extinction).
     """
 
     low: Parameter

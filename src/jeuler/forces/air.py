@@ -52,13 +52,10 @@ class Wind:
     Args:
       velocity: (dim,), m/s, or a function ``velocity(t) -> (dim,)``. Differentiable.
     Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
-    Raises: nothing of its own.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> jeuler.Wind([3.0, 0.0])(0.0, jnp.zeros((2, 2))).tolist()
       [[3.0, 0.0], [3.0, 0.0]]
-
-    Source: J. Wejchert, D. Haumann, Animation Aerodynamics, SIGGRAPH 1991 (flow primitives).
     """
 
     velocity: MovingParameter
@@ -80,7 +77,6 @@ class Gust:
       velocity: of the air at the height of the gust, (dim,), m/s. Differentiable.
       period: from one gust to the next, (), s. Differentiable.
     Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
-    Raises: nothing of its own.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> jeuler.Gust([4.0, 0.0], period=2.0)(1.0, jnp.zeros((1, 2))).tolist()
@@ -117,7 +113,6 @@ class Turbulence:
       phases: (wave,), rad.
       frequencies: f, (wave,), rad.
     Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
-    Raises: nothing of its own.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> jeuler.turbulence(dim=3, speed=1.0, size=0.5, seed=1)(0.0, jnp.zeros((4, 3))).shape
@@ -191,7 +186,6 @@ class Vortex:
       core: radius of the core, (), m, > 0. Differentiable.
       axis: (3,), direction of the axis in space, any length; ignored in the plane. Differentiable.
     Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
-    Raises: nothing of its own.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> w = jeuler.Vortex([0.0, 0.0], circulation=2 * jnp.pi, core=0.1)(0.0, jnp.array([[1.0, 0.0], [0.0, 0.0]]))

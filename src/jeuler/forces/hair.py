@@ -26,13 +26,10 @@ def strand_edges(strands: Any) -> np.ndarray:
     Args:
       strands: particle indices along each strand from its root, integers (strand, node).
     Returns: the pairs, integers (strand x (node - 1), 2).
-    Raises: nothing of its own.
     Example:
       >>> import jeuler
       >>> jeuler.strand_edges([[0, 1, 2], [3, 4, 5]]).tolist()
       [[0, 1], [1, 2], [3, 4], [4, 5]]
-
-    Source: H. Iben et al., Artistic Simulation of Curly Hair, SCA 2013 (polylines of hair).
     """
     strands = np.asarray(strands)
     return np.stack([strands[:, :-1], strands[:, 1:]], axis=-1).reshape(-1, 2)

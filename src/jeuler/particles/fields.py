@@ -43,8 +43,6 @@ def uses(
       ...     return (temperature / 300.0 - 1.0)[:, None] * position.at[:].set([0.0, 9.81])
       >>> buoyancy.reads
       ('temperature',)
-
-    Source: the idea of declared reads and writes is that of entity component systems.
     """
 
     if acts not in (None, *ACTS):

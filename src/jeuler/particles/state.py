@@ -49,7 +49,6 @@ class ParticleState:
       births: () int32, the number of particles born since the start.
       missed_births: () int32, the births that found no free slot.
       extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
-    Raises: nothing; `simulate` checks it.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.zeros((3, 2)), mass=[jnp.inf, 1.0, 1.0])
@@ -57,9 +56,6 @@ class ParticleState:
       ((3, 2), [inf, 1.0, 1.0], None)
       >>> state.replace(temperature=jnp.array([20.0, 30.0, 40.0])).temperature.tolist()
       [20.0, 30.0, 40.0]
-
-    Source: A. Witkin, Particle System Dynamics, SIGGRAPH course notes, 1997, sect. 2; W. T. Reeves, Particle Systems:
-      A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.2 (attributes).
     """
 
     position: Parameter
@@ -169,8 +165,6 @@ def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -
       >>> pool = jeuler.empty_pool(100, dim=3)
       >>> pool.position.shape, int(pool.alive.sum())
       ((100, 3), 0)
-
-    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.1.
     """
     capacity, dim = checks.count("capacity", capacity, least=1), checks.count("dim", dim, least=1)
     zeros = jnp.zeros((capacity, dim), dtype or float)

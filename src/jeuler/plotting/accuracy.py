@@ -23,7 +23,6 @@ def plot_work_precision(table: Any, ax: Any = None) -> Any:
       table: what `work_precision` returned.
       ax: None makes a figure; one axes takes error against seconds, a pair takes both, of all precisions.
     Returns: the axes drawn on: (precision, 2), or as given.
-    Raises: nothing.
     Example:
       >>> import jeuler
       >>> from jeuler.plotting import plot_work_precision

@@ -79,15 +79,11 @@ class Uniform(Sampler):
       low: () or (component,). Differentiable.
       high: () or (component,). Differentiable.
     Returns: called as ``sampler(key, count)``, (count,) or (count, component).
-    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.Uniform(1.0, 2.0)(jax.random.key(0), 100)
       >>> x.shape, bool((x >= 1).all() and (x < 2).all())
       ((100,), True)
-
-    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
-      sect. 2 (attributes drawn at birth).
     """
 
     low: Parameter
@@ -115,7 +111,6 @@ class Normal(Sampler):
       mean: () or (component,). Differentiable.
       deviation: standard deviation, () or (component,). Differentiable.
     Returns: called as ``sampler(key, count)``, (count,) or (count, component).
-    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> jeuler.Normal([0.0, 1.0], 0.1)(jax.random.key(0), 5).shape
@@ -147,14 +142,10 @@ class Choice(Sampler):
     Args:
       values: (choice, ...). Differentiable; which row is drawn is not.
     Returns: called as ``sampler(key, count)``, (count, ...).
-    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> sorted(set(jeuler.Choice([1.0, 5.0])(jax.random.key(0), 50).tolist()))
       [1.0, 5.0]
-
-    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
-      sect. 2 (attributes drawn at birth).
     """
 
     values: Parameter

@@ -24,15 +24,11 @@ class FromLine(Sampler):
       start: (dim,), m. Differentiable.
       end: (dim,), m. Differentiable.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
-    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.FromLine([0.0, 1.0], [2.0, 1.0])(jax.random.key(0), 3)
       >>> x.shape, x[:, 1].tolist()
       ((3, 2), [1.0, 1.0, 1.0])
-
-    Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983,
-      sect. 2 (attributes drawn at birth).
     """
 
     start: Parameter
@@ -58,7 +54,6 @@ class FromDisc(Sampler):
       radius: (), m. Differentiable.
       normal: (3,), the axis of a disc in space; ignored in the plane.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
-    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.FromDisc([0.0, 0.0, 5.0], 1.0)(jax.random.key(0), 4)
@@ -98,7 +93,6 @@ class FromSphere(Sampler):
       radius: (), m. Differentiable.
       surface: True draws from the surface only.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
-    Raises: nothing of its own.
     Example:
       >>> import jax, jax.numpy as jnp, jeuler
       >>> x = jeuler.FromSphere([0.0, 0.0, 0.0], 2.0, surface=True)(jax.random.key(0), 4)
@@ -181,7 +175,6 @@ class Cone(Sampler):
       speed: (), m/s, or a sampler of it. Differentiable.
       angle: half the opening angle, (), rad; pi is every direction. Differentiable.
     Returns: called as ``sampler(key, count)``, (count, dim), m/s.
-    Raises: nothing of its own.
     Example:
       >>> import jax, jeuler
       >>> jet = jeuler.Cone([0.0, 0.0, 1.0], speed=jeuler.Uniform(4.0, 6.0), angle=0.2)

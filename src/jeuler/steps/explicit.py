@@ -66,7 +66,6 @@ def euler_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
       dt: step size, scalar, s.
       args: passed to f; any pytree.
     Returns: the state at t + dt, of the structure, shapes and dtypes of y. Its cumulative error is O(dt).
-    Raises: nothing of its own; `solve` checks its inputs once.
     Example:
       >>> import jeuler
       >>> round(float(jeuler.euler_step(lambda x, y, args: x + y / 5, 0.0, -3.0, 1.0, None)), 4)
@@ -177,7 +176,6 @@ def heun_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
       dt: step size, scalar, s.
       args: passed to f; any pytree.
     Returns: the state at t + dt. Two evaluations of f; cumulative error O(dt^2).
-    Raises: nothing of its own; `solve` checks its inputs once.
     Example:
       >>> import jeuler
       >>> float(jeuler.heun_step(lambda t, y, args: y, 0.0, 1.0, 1.0, None))
@@ -201,7 +199,6 @@ def rk4_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
       dt: step size, scalar, s.
       args: passed to f; any pytree.
     Returns: the state at t + dt. Four evaluations of f; cumulative error O(dt^4).
-    Raises: nothing of its own; `solve` checks its inputs once.
     Example:
       >>> import jeuler
       >>> round(float(jeuler.rk4_step(lambda t, y, args: y, 0.0, 1.0, 1.0, None)), 4)

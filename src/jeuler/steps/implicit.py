@@ -137,7 +137,6 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> LinearlyImplicitEul
       linear_solver: a lineax solver; None: LU up to 128 unknowns, BiCGStab without a matrix above.
     Returns: a step ``(f, t, y, dt, args) -> y`` for `solve` and `simulate`; NaN where the linear solve failed. Its
       cumulative error is O(dt).
-    Raises: nothing.
     Example:
       >>> import jeuler
       >>> step = jeuler.linearly_implicit_euler()
