@@ -1,8 +1,8 @@
-"""What XLA on CPU is to work out once and store, said in arithmetic that costs nothing.
+"""Hints that make XLA:CPU materialise a value instead of recomputing it in every consumer.
 
-XLA fuses what it thinks cheap into each of its consumers, and so does it again for each. A division it never repeats;
-these are divisions and differences by numbers that are 1 and 0, but no constants to XLA. LLVM, which comes after it,
-knows that no float is greater than inf, and drops them.
+XLA fuses what it considers cheap into each of its consumers, and so computes it again for each. It never duplicates a
+division: these are divisions by 1 and subtractions of 0 that are not constants to XLA. LLVM, which runs after it, knows
+that no float is greater than inf, and removes them, so that the hint itself costs nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ stored_p = Primitive("stored")
 
 
 def stored(x: Array) -> Array:
-    """x and its cotangent, each worked out once and stored, not again for each of its uses."""
+    """x and its cotangent, each computed once and stored, not again for each of its uses."""
     return stored_p.bind(x)
 
 
@@ -39,7 +39,7 @@ def _kept_jvp(primals, tangents):
 
 
 def padded(x: Array, width: int) -> Array:
-    """x with so many zeros before and behind, along its last axis.
+    """x with ``width`` zeros before and after it, along its last axis.
 
     A pad by itself runs through an older, slower loop of XLA than one that is fused with arithmetic.
     """

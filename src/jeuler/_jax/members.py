@@ -7,7 +7,7 @@
 The function is one equation, `members_p`, that holds the jaxpr of one member. Batching notes the axis of each operand
 and leaves the jaxpr as it is; derivatives are those of the jaxpr, again such equations; what is compiled has the batch
 axis last (see `batch_last`). XLA keeps the carry of a loop in memory in the order that its body asks for, so that from
-step to step nothing is transposed. 1,024 chains of 16 take half of the time so, their gradient 0.7.
+step to step nothing is transposed. 1,024 chains of 16 run twice as fast so, their gradient 1.4 times.
 """
 
 from __future__ import annotations

@@ -69,8 +69,8 @@ def _laplacian(*operands, offsets):
     around = padded(x, reach)
     force = 0
     for k, weight in zip(offsets, c, strict=True):
-        before, behind = around[..., reach - k : reach - k + n], around[..., reach + k : reach + k + n]
-        force = force + weight[..., k:] * (x - behind) - weight[..., :n] * (before - x)
+        before, after = around[..., reach - k : reach - k + n], around[..., reach + k : reach + k + n]
+        force = force + weight[..., k:] * (x - after) - weight[..., :n] * (before - x)
     return force
 
 

@@ -98,7 +98,7 @@ class Indexed(Layout):
 class Shifts(Layout):
     """Edges of constant offset k: slot s of a group holds the edge (s - k, s).
 
-    The two maps and the layout of their slots are those of `jeuler.forces.laplacian`. What is one number for all edges
+    The two maps and the layout of their slots are those of `jeuler.graphs.laplacian`. What is one number for all edges
     is one array for all groups, of the longest one's length: half the memory traffic of cloth.
     """
 
@@ -137,11 +137,11 @@ class Shifts(Layout):
         return [parameter[: self.particles + k] for k in self.offsets]
 
 
-LONGEST_ROW = 32  # slots that one row looks up; the hub that meets more edges has several rows
+LONGEST_ROW = 32  # slots that one row looks up; a particle that meets more edges has several rows
 GROUP_COST = 500  # slots that one more group of rows costs in overhead,
 GROUP_SHARE = 1 / 60  # and at least this share of all, so that the program stays short
 MOST_TURNS = 100  # of edges from one owner to the other; a mesh needs 30
-FURTHER_COST = 16  # slots that a further row of a particle costs, as its sum is scattered
+FURTHER_COST = 16  # slots that an extra row of a particle costs, as its sum is scattered
 
 
 class Rows(Indexed):
@@ -150,8 +150,8 @@ class Rows(Indexed):
         row 7 owns    (7, 2) (7, 9) (7, 30)  -       B x:    x7 - x2, x7 - x9, x7 - x30, 0
         row 7 meets   (4, 7) (11, 7)                 B^T f:  the sum of row 7, minus f in the slots (4, 7) and (11, 7)
 
-    Who owns an edge is chosen so that all particles own about as many: a few columns (column, row) then hold nearly
-    all edges, with few empty slots, and loops run over all the rows. Who owns more than there are columns has further
+    Owners are chosen so that all particles own about equally many edges: a few columns (column, row) then hold nearly
+    all edges, with few empty slots, and loops run over all the rows. A particle with more edges than columns gets extra
     rows. The edges that a particle meets are as uneven as its degree: their tables are in groups of like length.
     Rows go by group, in it in reverse Cuthill-McKee order, and the slots of a row in the order of the far ends: what
     a column looks up lies near what it looked up before.
@@ -167,8 +167,8 @@ class Rows(Indexed):
         owner, other = evenly_owned(edges, particles)
         owned, met = (np.bincount(ends, minlength=particles) for ends in (owner, other))
 
-        # A row for each particle that has edges, and a last one of empty slots: its sum is that of all who have none,
-        # its slots are read by who meets less edges than its group.
+        # A row for each particle that has edges, and a last one of empty slots: its sum is that of particles without
+        # edges, and its slots are read by those that meet fewer edges than others of their group.
         order = near_order(edges, particles)
         order = order[(owned + met)[order] > 0]
         length = np.clip(met[order], 1, LONGEST_ROW)

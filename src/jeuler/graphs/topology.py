@@ -58,8 +58,8 @@ class Topology(Indices):
         """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
 
         The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
-        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. Of
-        the others, if they are less than MANY, or less than one in FEW particles, `Pairs`, else `Rows`.
+        there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. The
+        other edges are `Pairs` if there are fewer than MANY of them, or than one in FEW particles, else `Rows`.
         """
         return _layouts(self, particles)
 

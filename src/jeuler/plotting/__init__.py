@@ -1,4 +1,4 @@
-"""Figures and animations; the only room that imports matplotlib."""
+"""Figures and animations; the only package that imports matplotlib."""
 
 from jeuler.plotting.accuracy import plot_work_precision
 from jeuler.plotting.camera import Camera

@@ -24,7 +24,7 @@ from jeuler._core import checks, trees
 from jeuler.steps.explicit import VectorField, pair, symplectic_euler_step
 
 PyTree = Any
-ROOM = 2  # bits: numbers may grow to four times the largest of the plain run
+HEADROOM = 2  # bits: numbers may grow to four times the largest of the plain run
 
 
 def check(f: VectorField, t: Any, y: PyTree, args: PyTree, step: Any, compensated: bool) -> None:
@@ -81,8 +81,8 @@ def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyT
             v = trees.add(v, kick(n, x, v, parameters, quanta))
             x = trees.add(x, drift(v, parameters, quanta))
             n = n + 1
-            lost = (first_nonfinite < 0) & ~trees.all_finite((x, v))
-            return (n, jnp.where(lost, n, first_nonfinite), (x, v)), None
+            newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite((x, v))
+            return (n, jnp.where(newly_nonfinite, n, first_nonfinite), (x, v)), None
 
         (_, first_nonfinite, y), _ = lax.scan(one_step, (n, first_nonfinite, y), None, length=grid.save_every)
         return first_nonfinite, y
@@ -133,9 +133,9 @@ def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyT
 
 
 def quantum(largest: Array) -> Array:
-    """The power of two of which numbers up to 2^ROOM times the largest are exact multiples."""
+    """The power of two of which numbers up to 2^HEADROOM times the largest are exact multiples."""
     _, exponent = jnp.frexp(largest)
-    return jnp.ldexp(jnp.ones_like(largest), exponent + ROOM - jnp.finfo(largest.dtype).nmant - 1)
+    return jnp.ldexp(jnp.ones_like(largest), exponent + HEADROOM - jnp.finfo(largest.dtype).nmant - 1)
 
 
 def rounded(x: PyTree, quanta: PyTree) -> PyTree:

@@ -1,4 +1,4 @@
-"""The only ``lax.scan``: the clock, saving, checkpointing, compensated sums, and the Solution."""
+"""``solve`` on a fixed grid of times: the clock, saving, checkpointing, compensated sums, and the Solution."""
 
 from __future__ import annotations
 
@@ -132,8 +132,8 @@ def _solve(
         return solve_reversibly(f, y0, args, grid, save, step, compensated)
     advance = advance_by(step, compensated=compensated)
 
-    def next_state(n, t, y_and_lost):
-        return advance(f, t, y_and_lost, grid.dt, args)
+    def next_state(n, t, y_and_remainder):
+        return advance(f, t, y_and_remainder, grid.dt, args)
 
     return scan_grid(next_state, (y0, no_remainder(y0, compensated)), grid, save)
 
@@ -152,9 +152,9 @@ def solve_reversibly(
     y0, between_saves = reversible(f, y0, args, grid)
 
     def within(run, carry):
-        n, first_nonfinite, (y, lost) = carry
+        n, first_nonfinite, (y, remainder) = carry
         first_nonfinite, y = between_saves(n, first_nonfinite, y)
-        return n + grid.save_every, first_nonfinite, (y, lost)
+        return n + grid.save_every, first_nonfinite, (y, remainder)
 
     return scan_grid(lambda n, t, state: state, (y0, None), grid, save, within=within)
 
@@ -207,8 +207,8 @@ def scan_grid(
         n, first_nonfinite, state = carry
         state = next_state(n, grid.clock(n), state)
         n = n + 1
-        lost = (first_nonfinite < 0) & ~trees.all_finite(watch(state[0]))
-        return (n, jnp.where(lost, n, first_nonfinite), state), None
+        newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite(watch(state[0]))
+        return (n, jnp.where(newly_nonfinite, n, first_nonfinite), state), None
 
     def saved(carry):
         n, _, (y, _) = carry
@@ -267,7 +267,7 @@ def check_step(step: Any) -> None:
 
 
 def advance_by(step: Any, *, compensated: bool) -> Callable:
-    """The step on the pair (y, what rounding has cut off y so far; None in plain sums).
+    """The step on the pair (y, the remainder that rounding has cut off y so far; None in plain sums).
 
     Reverse mode keeps what an explicit step starts from and works the rest out again: that is less work than to store
     and load all that the step computes on its way. A step that solves equations keeps its solution.
@@ -275,8 +275,8 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
     check_step(step)
     if not compensated:
 
-        def plain(f, t, y_and_lost, dt, args):
-            y, _ = y_and_lost
+        def plain(f, t, y_and_remainder, dt, args):
+            y, _ = y_and_remainder
             y_next = step(f, t, y, dt, args)
             checks.same_form("the step", y, y_next)
             return y_next, None
@@ -293,12 +293,12 @@ def advance_by(step: Any, *, compensated: bool) -> Callable:
     def two_sum(y, increment):
         total = y + increment
         rounded = total - y
-        lost = (y - (total - rounded)) + (increment - rounded)
-        return total, lax.stop_gradient(lost)  # exactly zero in real arithmetic, so is its derivative
+        remainder = (y - (total - rounded)) + (increment - rounded)
+        return total, lax.stop_gradient(remainder)  # exactly zero in real arithmetic, so is its derivative
 
-    def compensating(f, t, y_and_lost, dt, args):
-        y, lost = y_and_lost
-        increment = trees.add(step.increment(f, t, y, dt, args), lost)
+    def compensating(f, t, y_and_remainder, dt, args):
+        y, remainder = y_and_remainder
+        increment = trees.add(step.increment(f, t, y, dt, args), remainder)
         pairs = jax.tree.map(two_sum, y, increment)
         return jax.tree.transpose(jax.tree.structure(y), jax.tree.structure((0, 0)), pairs)
 

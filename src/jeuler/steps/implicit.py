@@ -1,6 +1,6 @@
 """Implicit steps: backward Euler by Newton's method, and its one-linear-solve form; derivatives by implicit functions.
 
-``_newton`` solves; ``_root.root`` and jax's ``custom_linear_solve`` give the derivatives, in both modes and to any
+``_newton`` solves; ``_jax.root`` and JAX's ``custom_linear_solve`` give the derivatives, in both modes and to any
 order, at the price of one linear solve each.
 """
 
