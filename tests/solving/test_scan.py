@@ -235,8 +235,9 @@ GOOD = {"dt": 0.1, "num_steps": 10}
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dt": 0}, "dt must be greater than 0"),
-        ({"dt": -0.1}, "dt must be greater than 0"),
+        ({"dt": 0}, "dt must not be 0 s"),
+        ({"dt": 1e-320}, "dt must be from 2.2e-308 to 1.8e.308 s in float64"),
+        ({"dt": True}, "dt must be one finite real number, got True"),
         ({"dt": np.nan}, "dt must be one finite real number"),
         ({"dt": np.inf}, "dt must be one finite real number"),
         ({"dt": "fast"}, "dt must be one finite real number, got 'fast'"),

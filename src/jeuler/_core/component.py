@@ -8,9 +8,12 @@ from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from jeuler._core import checks
+from jeuler._core.arguments import constructor_says_what_to_write
 from jeuler._core.describe import object_table, summary
 from jeuler._core.partition import Rest, is_parameter, partition
 
@@ -33,6 +36,7 @@ def component(
 
     def decorate(cls: type[T]) -> type[T]:
         cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(_shown(cls))
+        constructor_says_what_to_write(cls)
         names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]  # made one above
         children = tuple(name for name in names if name not in static)
         keys = tuple(jax.tree_util.GetAttrKey(name) for name in children)
@@ -72,11 +76,17 @@ def _shown(cls: type[T]) -> type[T]:
 
 
 def as_float(x: ArrayLike | None) -> Array | None:
-    """A parameter as a floating array; Python numbers stay weakly typed, so they follow the state's dtype."""
-    if x is None or (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact)):
+    """A parameter as a floating array; Python numbers stay weakly typed, so they follow the state's dtype.
+
+    TypeError or ValueError for what is not made of real numbers: booleans and complex numbers are none.
+    """
+    if x is None or (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)):
         return x
-    if isinstance(x, (bool, int, float)):
+    if isinstance(x, (int, float)) and not isinstance(x, bool):
         return jnp.asarray(float(x))
+    kind = jnp.result_type(x) if isinstance(x, jax.Array) else np.asarray(x).dtype
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer) or kind == np.dtype(object)):
+        raise TypeError(f"{kind} is not real")
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 
@@ -92,7 +102,8 @@ def store_as_float(component: Any, *names: str) -> None:
             value = as_float(value)
         except (TypeError, ValueError):
             where = f"{type(component).__name__}.{name}"
-            raise ValueError(f"{where} must be a number, or an array or list of numbers, got {value!r}") from None
+            came = checks.shown(value)
+            raise ValueError(f"{where} must be a number, or an array or list of real numbers, got {came}") from None
         object.__setattr__(component, name, value)
 
 

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from jeuler._core import checks
+
 
 class Indices:
     """Particle indices, fixed while tracing: hashable and equal by content, read as an integer array."""
 
-    def __init__(self, indices: Any) -> None:
-        self.indices: np.ndarray = np.array(indices, dtype=np.int32)
+    def __init__(self, indices: Any, name: str = "indices", meaning: str = "integers, particle indices") -> None:
+        self.indices: np.ndarray = np.array(checks.integers(name, indices, meaning))
         self.indices.setflags(write=False)
         self._key = (self.indices.shape, hashlib.sha1(self.indices.tobytes()).hexdigest())
 

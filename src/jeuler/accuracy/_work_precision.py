@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.partition import arrays_only, is_parameter
 from jeuler._core.precision import cast, double_precision, flat, flat_rows, precision
 from jeuler.accuracy.reference import (
@@ -37,6 +38,7 @@ from jeuler.steps.stability import stability_limit
 PyTree = Any
 
 
+@says_what_to_write(dt="dts=[...]", num_steps="dts=[...]", step="steps=[...]", methods="steps=[...]")
 def work_precision(
     f: VectorField,
     y0: PyTree,
@@ -105,6 +107,8 @@ def work_precision(
     dts = _positive_values("dts", dts, "s")
     if not dts:
         raise ValueError("dts must name at least one step size, got none")
+    if max(dts) > 1.5 * (t1 - t0):
+        raise ValueError(f"each of dts must be below t1 - t0 = {t1 - t0:g} s, got {max(dts):g} s; take smaller ones")
     tolerances = _positive_values("tolerances", tolerances)
     repeats = checks.count("repeats", repeats, least=1)
     checks.positive("timeout", timeout, "s")
@@ -114,7 +118,7 @@ def work_precision(
         raise ValueError(f"dtypes must be float32 or float64, got {[str(d) for d in dtypes]}")
     with double_precision():
         y64, args64 = cast(y0, np.float64), cast(args, np.float64)
-        checks.same_form("the vector field f", y64, jax.eval_shape(f, t0, y64, args64))
+        checks.vector_field(f, t0, y64, args64)
         plans = {name: _plan(method, t0, t1, dts, tolerances) for name, method in methods.items()}
         times = np.unique(np.concatenate([run.times for plan in plans.values() for run in plan]).round(15))
         times = times[np.append(True, np.diff(times) > 1e-9 * (t1 - t0))]
@@ -219,7 +223,12 @@ def _limit(method: Any, f: VectorField, t0: float, y0: PyTree, args: PyTree) -> 
 
 
 def _positive_values(name: str, values: Any, unit: str = "") -> list[float]:
-    values = np.atleast_1d(np.asarray(values, dtype=float)).ravel().tolist() if np.ndim(values) < 2 else [math.nan]
+    try:
+        if isinstance(values, str) or np.ndim(values) > 1:
+            raise TypeError
+        values = np.atleast_1d(np.asarray(values)).tolist()
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be a list of numbers above 0, got {checks.shown(values)}") from None
     for value in values:
         checks.positive(f"each of {name}", value, unit)
     return values

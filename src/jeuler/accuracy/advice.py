@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
 from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler._core.partition import arrays_only
 from jeuler._core.precision import flat
@@ -54,6 +54,7 @@ class StepAdvice:
     reason: str
 
 
+@says_what_to_write(dt="nothing: it finds dt", num_steps="nothing: it finds it", tolerance="error=...")
 def advise_step(
     f: VectorField,
     y0: PyTree,
@@ -109,8 +110,12 @@ def advise_step(
     checks.untraced("advise_step", y0, args, t0, t1, error)
     t0, t1 = checks.interval(t0, t1)
     checks.positive("error", error)
+    checks.field_form(f)
     f, args = arrays_only(f, args)
-    checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
+    checks.vector_field(f, t0, y0, args)
+    checks.function("step", step, "(f, t, y, dt, args) -> y", "pass, say, jeuler.euler_step")
+    checks.true_or_false("relative", relative)
+    checks.true_or_false("compensated", compensated)
     if max_pilot_steps is None:
         max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))
     max_pilot_steps = checks.count("max_pilot_steps", max_pilot_steps, least=64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -63,6 +63,8 @@ def named(steps: Any) -> dict[str, Any]:
     if isinstance(steps, Mapping):
         methods = dict(steps)
     else:
+        if isinstance(steps, str) or not (callable(steps) or is_diffrax(steps) or isinstance(steps, Iterable)):
+            raise ValueError(f"steps must be a list of steps or a dict {{name: step}}, got {steps!r}")
         steps = [steps] if callable(steps) or is_diffrax(steps) else list(steps)
         methods = {getattr(s, "__name__", type(s).__name__).removesuffix("_step"): s for s in steps}
         if len(methods) < len(steps):

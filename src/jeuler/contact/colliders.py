@@ -36,13 +36,20 @@ class _Shape:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if callable(value):
+                where = f"{type(self).__name__}.{name}"
+                checks.refuse_class(f"{where} must be a vector or a function of time", value)
+                checks.function(where, value, "(t) -> (dim,)", "it gets the time, in s")
                 object.__setattr__(self, name, as_component(value))
+            elif name == "inside":
+                checks.true_or_false(f"{type(self).__name__}.inside", value)
             elif not isinstance(value, bool):
                 store_as_float(self, name)
 
     def check(self, dim: int) -> None:
         for name, value in vars(self).items():
-            shape = jax.eval_shape(value, jnp.zeros(())).shape if callable(value) else getattr(value, "shape", ())
+            where = f"{type(self).__name__}.{name}"
+            form = checks.form_of(where, value, jnp.zeros(())) if callable(value) else value
+            shape = getattr(form, "shape", ())
             if shape not in ((), (dim,)) or (shape == () and name in ("point", "normal", "center")):
                 raise ValueError(
                     f"{type(self).__name__}.{name} must have shape ({dim},), one component for each of position's, "
@@ -50,6 +57,7 @@ class _Shape:
                 )
             if callable(value) or checks.is_traced(value):
                 continue
+            checks.finite(where, value, infinite=name == "half_size")
             if name in ("radius", "half_size") and not np.all(np.asarray(value) >= 0):
                 raise ValueError(f"{type(self).__name__}.{name} must be at least 0 m, got {value}")
             if name == "normal" and not np.any(np.asarray(value)):
@@ -141,12 +149,19 @@ class Box(_Shape):
         return jnp.where(deepest > 0, length(jnp.maximum(q, 0)), deepest)
 
 
+def as_collider(name: str, collider: Any) -> Any:
+    """A collider as a pytree; one ValueError if it is none."""
+    checks.refuse_class(f"{name} must be a Plane, Sphere, Box or a function (t, point) -> ()", collider)
+    hint = "pass a Plane, Sphere, Box or a signed distance, (t, point) -> ()"
+    checks.function(name, collider, "(t, point) -> ()", hint)
+    return as_component(collider)
+
+
 def check_collider(collider: Any, dim: int) -> None:
     """One ValueError where a collider does not fit the dimension of the positions."""
-    if not callable(collider):
-        raise ValueError(f"a collider must be a Plane, Sphere, Box or a function (t, point) -> (), got {collider!r}")
     if hasattr(collider, "check"):
         collider.check(dim)
-    shape = jnp.shape(jax.eval_shape(collider, jnp.zeros(()), jnp.zeros(dim)))
-    if shape != ():
-        raise ValueError(f"a collider must return one signed distance, shape (), for a point, got {shape}")
+    form = checks.form_of("a collider", collider, jnp.zeros(()), jnp.zeros(dim))
+    if getattr(form, "shape", None) != () or not jnp.issubdtype(form.dtype, jnp.floating):
+        came = f"{form.dtype} of shape {form.shape}" if hasattr(form, "shape") else f"a {type(form).__name__}"
+        raise ValueError(f"a collider must return one signed distance, a float of shape (), for a point, got {came}")

@@ -12,8 +12,8 @@ from jax import lax
 from jeuler._core import checks
 from jeuler._core.annotations import ColliderLike, Parameter, default
 from jeuler._core.calls import previous_is_optional
-from jeuler._core.component import as_component, component, store_as_float
-from jeuler.contact.colliders import check_collider
+from jeuler._core.component import component, store_as_float
+from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.contact.impacts import Impacts, Path
 
 
@@ -57,19 +57,22 @@ class Collisions:
     friction: Parameter = default(0.0)
     max_bounces: int = 3
 
+    forward_only = True
+
     def __post_init__(self) -> None:
         if not isinstance(self.colliders, (tuple, list)):
             raise ValueError(
                 f"Collisions.colliders must be a tuple, got {type(self.colliders).__name__}; write (collider,)"
             )
-        object.__setattr__(self, "colliders", tuple(as_component(c) for c in self.colliders))
+        colliders = tuple(as_collider(f"Collisions.colliders[{k}]", c) for k, c in enumerate(self.colliders))
+        object.__setattr__(self, "colliders", colliders)
         object.__setattr__(self, "pairs", _pairs(self.pairs))
-        checks.count("max_bounces", self.max_bounces, least=1)
+        checks.count("Collisions.max_bounces", self.max_bounces, least=1)
         store_as_float(self, "radius", "restitution", "friction")
         for name, most in (("radius", np.inf), ("restitution", 1.0), ("friction", np.inf)):
             value = getattr(self, name)
             if not checks.is_traced(value) and not bool(jnp.all((value >= 0) & (value <= most))):
-                raise ValueError(f"Collisions.{name} must be from 0 to {most}, got {value}")
+                raise ValueError(f"Collisions.{name} must be from 0 to {most}, got {checks.shown(value.tolist())}")
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
@@ -94,13 +97,12 @@ class Collisions:
 
 
 def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
-    array = np.asarray(pairs)
+    array = checks.integers("Collisions.pairs", pairs, "integers of shape (pair, 2)")
     if array.size == 0:
         return ()
-    if array.ndim != 2 or array.shape[1] != 2 or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(
-            f"Collisions.pairs must be integers of shape (pair, 2), got {array.dtype} of shape {array.shape}"
-        )
-    if (array < 0).any() or (array[:, 0] == array[:, 1]).any():
-        raise ValueError(f"Collisions.pairs must join two different particles, indices from 0, got {array.tolist()}")
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"Collisions.pairs must be integers of shape (pair, 2), got {array.shape}")
+    checks.different("Collisions.pairs", array, "particles")
+    if len(np.unique(np.sort(array, axis=1), axis=0)) < len(array):
+        raise ValueError("Collisions.pairs must name each pair once, got one twice; drop what is repeated")
     return tuple((int(i), int(j)) for i, j in array)

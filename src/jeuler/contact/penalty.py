@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,9 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.annotations import ColliderParameter, Parameter, default
-from jeuler._core.component import as_component, component, store_as_float
-from jeuler.contact.colliders import check_collider, normal_and_speed
+from jeuler._core.component import component, store_as_float
+from jeuler._core.limits import check_limits
+from jeuler.contact.colliders import as_collider, check_collider, normal_and_speed
 
 
 @component(positive=("ks", "kd", "radius"))
@@ -44,8 +45,10 @@ class PenaltyContact:
     kd: Parameter = default(0.0)
     radius: Parameter = default(0.0)
 
+    limits: ClassVar = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "radius": (">= 0", "m")}
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "collider", as_component(self.collider))
+        object.__setattr__(self, "collider", as_collider("PenaltyContact.collider", self.collider))
         store_as_float(self, "ks", "kd", "radius")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
@@ -66,6 +69,5 @@ class PenaltyContact:
     def check(self, particles: int, dim: int) -> None:
         for name, shapes in (("ks", ((),)), ("kd", ((),)), ("radius", ((), (particles,)))):
             checks.shape(f"PenaltyContact.{name}", getattr(self, name).shape, *shapes)
-        for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("radius", "m")):
-            checks.not_negative(f"PenaltyContact.{name}", getattr(self, name), unit)
+        check_limits(self)
         check_collider(self.collider, dim)

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.diagnosis.rerun import Rerun, coincident, largest, lost_particles, springs_among
+from jeuler.particles._simulate import check_kinds
 from jeuler.particles.fields import name_of
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -66,6 +68,7 @@ class Diagnosis:
         return f"the {self.quantity} is lost{where}, {self.part}{who}: {self.cause}; {self.remedy}"
 
 
+@says_what_to_write()
 def diagnose(
     scene: Scene,
     state: ParticleState,
@@ -100,6 +103,7 @@ def diagnose(
       >>> print(jeuler.diagnose(scene, state, dt=0.5, num_steps=1000))
       the value is lost in step ...: dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
     """
+    check_kinds(scene, state)
     for name, tree in (("state", state), ("scene", scene)):
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
             field = name + jax.tree_util.keystr(path)

@@ -17,6 +17,8 @@ from jeuler._core.vectors import direction
 from jeuler.particles.fields import START
 from jeuler.particles.state import DEFAULTS
 
+NOT_DRAWN = ("position", "velocity", "mass", "alive", "age", "lifetime", "births", "missed_births", "extra")
+
 
 @component(static=("field",))
 class OverLife:
@@ -53,7 +55,13 @@ class OverLife:
     acts = START
 
     def __post_init__(self) -> None:
-        if self.field == "shape":
+        if not isinstance(self.field, str):
+            raise ValueError(
+                f'OverLife.field must be the name of a field, such as "opacity", got {checks.shown(self.field)}'
+            )
+        if self.field in NOT_DRAWN:
+            raise ValueError(f"OverLife.field must be a field that is drawn or one of your own, got {self.field!r}")
+        if self.field == "shape" and isinstance(self.values, (list, tuple)):
             object.__setattr__(self, "values", jnp.asarray(self.values, float))
         store_as_float(self, "values", "times", "duration")
         if self.values.ndim < 1 or len(self.values) < 1:
@@ -64,6 +72,7 @@ class OverLife:
             )
         if self.times is not None:
             checks.increasing("OverLife.times", self.times)
+            checks.finite("OverLife.times", self.times)
         if self.duration is not None:
             checks.positive("OverLife.duration", self.duration, "s")
 
@@ -130,10 +139,12 @@ class SpeedLimit:
 
     limit: Parameter
 
+    forward_only = True
+
     def __post_init__(self) -> None:
         store_as_float(self, "limit")
         if not checks.is_traced(self.limit) and not (np.asarray(self.limit) >= 0).all():
-            raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {self.limit.min()}")
+            raise ValueError(f"SpeedLimit.limit must be at least 0 m/s, got {checks.shown(self.limit.tolist())}")
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:

@@ -12,9 +12,10 @@ from jax import Array, lax
 from jeuler._core import checks, trees
 from jeuler._core.annotations import ColliderParameter, OptionalParameter, Parameter, SampledParameter, default
 from jeuler._core.calls import previous_is_optional
-from jeuler._core.component import as_component, component, store_as_float
+from jeuler._core.component import component, store_as_float
 from jeuler._core.components import by_component
-from jeuler.contact.colliders import check_collider
+from jeuler._core.limits import Limits, check_limits
+from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.particles.fields import BEFORE
 from jeuler.particles.state import COUNTERS, DEFAULTS
 from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
@@ -45,8 +46,8 @@ class Emitter:
       max_births: the most births in one step, an integer; fewer draws cost less. None allows the whole pool. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state with the births of the step from t
       to t + dt.
-    Raises: ValueError, if rate is negative, a burst is not a pair (time, number) or max_births is below 1; in
-      `simulate`, if it got no key, or a sampler's shape does not fit.
+    Raises: ValueError, if rate, lifetime or mass is out of range, a burst is not a pair (time, number) or max_births is
+      below 1; in `simulate`, if it got no key, or a sampler's shape does not fit.
     Example:
       >>> import jax, jeuler
       >>> jet = jeuler.Emitter(100.0, position=[0.0, 0.0], velocity=jeuler.Cone([0.0, 1.0], speed=5.0, angle=0.3))
@@ -75,6 +76,9 @@ class Emitter:
 
     acts = BEFORE
     random = True
+    forward_only = True
+    limits: ClassVar[Limits] = {"rate": (">= 0", "1/s"), "start": ("", "s"), "stop": ("", "s")}
+    may_be_infinite: ClassVar[tuple[str, ...]] = ("start", "stop")
 
     def __post_init__(self) -> None:
         checks.number("Emitter.rate", self.rate)
@@ -83,18 +87,29 @@ class Emitter:
         if self.max_births is not None:
             checks.count("Emitter.max_births", self.max_births, least=1)
         try:
-            bursts = tuple((float(time), checks.count("number", number)) for time, number in self.bursts)
+            bursts = tuple((_finite_time(time), checks.count("number", number)) for time, number in self.bursts)
         except (TypeError, ValueError):
             raise ValueError(
-                f"Emitter.bursts must be pairs (time in s, number of births >= 0), got {self.bursts!r}"
+                f"Emitter.bursts must be pairs (time in s, number of births >= 0), got {checks.shown(self.bursts)}; "
+                f"write bursts=((0.5, 100),)"
             ) from None
         object.__setattr__(self, "bursts", bursts)
         store_as_float(self, "rate", "start", "stop")
         for name in ("position", "velocity", *_OPTIONAL):
-            object.__setattr__(self, name, as_sampler(f"Emitter.{name}", getattr(self, name)))
+            value = getattr(self, name)
+            if value is None and name in ("position", "velocity"):
+                raise ValueError(f"Emitter.{name} must be a sampler such as FromDisc(...), or one vector, got None")
+            object.__setattr__(self, name, as_sampler(f"Emitter.{name}", value))
+        for name, unit in (("lifetime", "s"), ("mass", "kg")):
+            value = getattr(self, name)
+            if value is not None and not callable(value):
+                checks.above_zero(f"Emitter.{name}", value, unit)
         if self.extra is not None:
+            if not isinstance(self.extra, dict):
+                raise ValueError(f"Emitter.extra must be a dict of samplers by name, got {checks.shown(self.extra)}")
             extra = {name: as_sampler(f"Emitter.extra[{name!r}]", x) for name, x in self.extra.items()}
             object.__setattr__(self, "extra", extra)
+        check_limits(self)
 
     @property
     def samplers(self) -> dict[str, Any]:
@@ -167,6 +182,11 @@ class Emitter:
                 )
 
 
+def _finite_time(time: Any) -> float:
+    checks.number("time", time)
+    return float(time)
+
+
 def step_number(t: Any, dt: Any) -> Array:
     """t / dt to an integer that grows by exactly one a step: rounding puts the edge away from the usual fractions."""
     return jnp.floor(lax.stop_gradient(t / dt) + 0.618)
@@ -215,6 +235,7 @@ class Lifetime:
     duration: OptionalParameter = default(None)
 
     acts = BEFORE
+    forward_only = True
     sets: ClassVar[tuple[str, ...]] = ("age",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
@@ -243,6 +264,7 @@ class Death:
     Args:
       condition: a function ``condition(t, state) -> (particle,)`` boolean. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state without the particles for which it holds.
+    Raises: ValueError, if the condition is not a function of (t, state); in `simulate`, if it does not return booleans.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> too_hot = jeuler.Death(lambda t, state: state.temperature > 100.0)
@@ -254,11 +276,22 @@ class Death:
     condition: Callable[[Any, Any], Array]
 
     acts = BEFORE
+    forward_only = True
     writes: ClassVar[tuple[str, ...]] = ("alive",)
+
+    def __post_init__(self) -> None:
+        hint = "write Death(lambda t, state: state.position[:, 1] < 0)"
+        checks.function("Death.condition", self.condition, "(t, state) -> (particle,) boolean", hint)
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
-        return state.replace(alive=state.alive & ~self.condition(t, state))
+        dying = jnp.asarray(self.condition(t, state))
+        if dying.dtype != bool or dying.shape not in ((), state.alive.shape):
+            raise ValueError(
+                f"Death.condition must return a boolean a particle, {state.alive.shape}, got {dying.dtype} of shape "
+                f"{dying.shape}; write a comparison, such as state.position[:, 1] < 0"
+            )
+        return state.replace(alive=state.alive & ~dying)
 
 
 @component()
@@ -269,7 +302,7 @@ class DeathOutside:
       low: (dim,) or (), m; -inf leaves a side open.
       high: (dim,) or (), m.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state without the particles outside.
-    Raises: ValueError, in `simulate`, if a bound has another shape.
+    Raises: ValueError, if low is above high; in `simulate`, if a bound has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> scene = jeuler.Scene(effects=(jeuler.DeathOutside(low=[-1.0, -1.0], high=[1.0, 1.0]),))
@@ -282,10 +315,13 @@ class DeathOutside:
     high: Parameter
 
     acts = BEFORE
+    forward_only = True
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
         store_as_float(self, "low", "high")
+        checks.fit_together("DeathOutside", low=self.low, high=self.high)
+        checks.in_order("DeathOutside.low", self.low, "DeathOutside.high", self.high)
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
@@ -324,10 +360,11 @@ class DeathOnContact:
     margin: Parameter = default(0.0)
 
     acts = BEFORE
+    forward_only = True
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "collider", as_component(self.collider))
+        object.__setattr__(self, "collider", as_collider("DeathOnContact.collider", self.collider))
         store_as_float(self, "margin")
 
     @previous_is_optional

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jeuler._core import checks
@@ -26,7 +25,7 @@ class SampledPath:
       times: increasing sample times, shape (sample,), s; two at least.
       positions: sample positions, shape (sample, ...), m. Differentiable.
     Returns: called as ``path(t)``, the position at time t, shape (...), m.
-    Raises: ValueError, if times decrease or repeat, or if the two lengths differ.
+    Raises: ValueError, if times decrease or repeat, a number is not finite, or the two lengths differ.
     Example:
       >>> import jeuler
       >>> path = jeuler.SampledPath([0.0, 1.0, 2.0], [[0.0, 0.0], [1.0, 1.0], [2.0, 4.0]])
@@ -42,7 +41,9 @@ class SampledPath:
     def __post_init__(self) -> None:
         store_as_float(self, "times", "positions")
         times = self.times
-        if times.ndim != 1 or len(times) < 2 or len(self.positions) != len(times):
+        for name in ("times", "positions"):
+            checks.finite(f"SampledPath.{name}", getattr(self, name))
+        if times.ndim != 1 or len(times) < 2 or self.positions.shape[:1] != times.shape:
             raise ValueError(
                 f"SampledPath.times must have shape (sample,) with two samples at least and positions (sample, ...), "
                 f"got {times.shape} and {self.positions.shape}"
@@ -67,7 +68,8 @@ class PrescribedMotion:
         `SampledPath` or ``jax.tree_util.Partial``, is differentiable in its leaves.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state with these particles on their path
       at time t.
-    Raises: ValueError, in `simulate`, if an index is out of range or repeated, or the path has another shape.
+    Raises: ValueError, if an index is no integer or repeated, or the path is no function of t; in `simulate`, if an
+      index is out of range or the path has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> hand = jeuler.PrescribedMotion([0], lambda t: jnp.stack([jnp.sin(t), 0.0 * t])[None])
@@ -83,8 +85,12 @@ class PrescribedMotion:
     path: MovingParameter
 
     def __post_init__(self) -> None:
-        particles = tuple(int(k) for k in np.asarray(self.particles).ravel())
-        object.__setattr__(self, "particles", particles)
+        given = list(self.particles) if isinstance(self.particles, range) else self.particles
+        indices = checks.integers("PrescribedMotion.particles", given, "integers, particle indices")
+        object.__setattr__(self, "particles", tuple(map(int, indices.ravel())))
+        checks.refuse_class("PrescribedMotion.path must be a function of time or a SampledPath", self.path)
+        hint = "write lambda t: jnp.asarray(points), or a SampledPath(times, positions)"
+        checks.function("PrescribedMotion.path", self.path, "(t) -> (prescribed, dim)", hint)
         object.__setattr__(self, "path", as_component(self.path))
 
     def prescribe(self, t: Any, dtype: Any) -> tuple[Any, Array, Array, Array]:
@@ -109,5 +115,9 @@ class PrescribedMotion:
             raise ValueError(
                 f"PrescribedMotion.particles must be different indices from 0 to {particles - 1}, got {list(indices)}"
             )
-        shape = jax.eval_shape(self.path, jnp.zeros(())).shape
+        form = checks.form_of("PrescribedMotion.path", self.path, jnp.zeros(()))
+        shape = getattr(form, "shape", None)
+        if shape is None:
+            came = type(form).__name__
+            raise ValueError(f"PrescribedMotion.path(t) must be one array (prescribed, dim), got a {came}")
         checks.shape("PrescribedMotion.path(t)", shape, (len(indices), dim), meaning="(prescribed, dim)")

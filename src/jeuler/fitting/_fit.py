@@ -6,12 +6,14 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
 from jeuler.fitting.engine import Options, Problem, run
 from jeuler.fitting.result import Fit
 
 PyTree = Any
 
 
+@says_what_to_write()
 def fit(
     residual: Callable[..., PyTree],
     params: PyTree,

@@ -8,6 +8,7 @@ from typing import Any
 from jax import Array
 
 from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.fitting._tables import fit_table
 from jeuler.fitting.engine import Options
@@ -88,6 +89,7 @@ class SpringFit:
 as_pytree(SpringFit, ("message", "undetermined", "blind", "at_bound", "start"))
 
 
+@says_what_to_write()
 def fit_springs(
     scene: Scene,
     state: ParticleState,

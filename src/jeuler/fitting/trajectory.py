@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.describe import object_table, summary
 from jeuler.fitting.recordings.reading import read_table
 from jeuler.fitting.recordings.recording import Recording, longest, understand
@@ -37,6 +38,7 @@ class Trajectory(NamedTuple):
         return object_table(self)
 
 
+@says_what_to_write()
 def read_trajectory(
     path: Any, *, time: str | None = None, run: str | int | None = None, si: bool = False, skip: int = 0
 ) -> Trajectory:

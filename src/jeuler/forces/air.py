@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jeuler._core import checks
 from jeuler._core.annotations import MovingParameter, Parameter, default
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import as_component, component, store_as_float
 from jeuler._core.in_time import at_time, moving
+from jeuler._core.limits import check_limits
 
 
 def as_air(air: Any) -> Any:
@@ -19,7 +22,12 @@ def as_air(air: Any) -> Any:
     if air is None:
         return ()
     if isinstance(air, (tuple, list)) and all(callable(part) for part in air):
+        for part in air:
+            checks.function("air", part, "(t, position) -> (particle, dim)", "it gets all positions at once")
         return tuple(as_component(part) for part in air)
+    checks.refuse_class("air must be a field such as Wind(...)", air)
+    if callable(air):
+        checks.function("air", air, "(t, position) -> (particle, dim)", "it gets all positions at once")
     return (as_component(air) if callable(air) else Wind(air),)
 
 
@@ -33,7 +41,9 @@ def check_air(name: str, air: tuple[Any, ...], particles: int, dim: int) -> None
     t, position = jnp.zeros(()), jnp.zeros((particles, dim))
     for part in air:
         try:
-            shape = jax.eval_shape(part, t, position).shape
+            shape = getattr(checks.form_of(f"{name}.air", part, t, position), "shape", "no array")
+        except jax.errors.JAXTypeError:
+            raise
         except (TypeError, ValueError) as error:
             shape = str(error).splitlines()[0]
         if shape != (particles, dim):
@@ -61,7 +71,7 @@ class Wind:
     velocity: MovingParameter
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "velocity", moving(self.velocity))
+        object.__setattr__(self, "velocity", moving("Wind.velocity", self.velocity))
 
     def __call__(self, t: Any, position: Array) -> Array:
         return jnp.broadcast_to(at_time(self.velocity, t, position.dtype), position.shape)
@@ -75,7 +85,7 @@ class Gust:
 
     Args:
       velocity: of the air at the height of the gust, (dim,), m/s. Differentiable.
-      period: from one gust to the next, (), s. Differentiable.
+      period: from one gust to the next, (), s, > 0. Differentiable.
     Returns: called as ``air(t, position)``, the velocity of the air at each particle, (particle, dim), m/s.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -88,8 +98,11 @@ class Gust:
     velocity: Parameter
     period: Parameter
 
+    limits: ClassVar = {"velocity": ("", "m/s"), "period": ("> 0", "s")}
+
     def __post_init__(self) -> None:
         store_as_float(self, "velocity", "period")
+        check_limits(self)
 
     def __call__(self, t: Any, position: Array) -> Array:
         strength = (1 - jnp.cos(2 * jnp.pi * t / self.period)) / 2
@@ -106,8 +119,8 @@ class Turbulence:
 
     Args:
       speed: root mean square, (), m/s. Differentiable.
-      size: of the eddies, (), m. Differentiable.
-      time: in which an eddy changes, (), s; inf freezes the field. Differentiable.
+      size: of the eddies, (), m, > 0. Differentiable.
+      time: in which an eddy changes, (), s, > 0; inf freezes the field. Differentiable.
       waves: k, (wave, dim), of length near 1.
       amplitudes: a, (wave, dim), unit vectors across the waves.
       phases: (wave,), rad.
@@ -129,8 +142,12 @@ class Turbulence:
     phases: Parameter
     frequencies: Parameter
 
+    limits: ClassVar = {"speed": (">= 0", "m/s"), "size": ("> 0", "m"), "time": ("> 0", "s")}
+    may_be_infinite: ClassVar = ("time",)
+
     def __post_init__(self) -> None:
         store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
+        check_limits(self)
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype
@@ -139,6 +156,7 @@ class Turbulence:
         return (self.speed * jnp.sqrt(2 / len(waves))).astype(dtype) * (jnp.cos(angle) @ amplitudes)
 
 
+@says_what_to_write()
 def turbulence(
     *, dim: int, speed: Any, size: Any, time: Any = float("inf"), modes: int = 12, seed: int = 0
 ) -> Turbulence:
@@ -152,7 +170,7 @@ def turbulence(
       modes: the number of waves; the cost grows with it.
       seed: an integer; the same seed gives the same field.
     Returns: the `Turbulence`.
-    Raises: ValueError, if dim is not 2 or 3.
+    Raises: ValueError, if dim is not 2 or 3, modes is not an integer above 0, or size, time or speed is out of range.
     Example:
       >>> import jeuler
       >>> jeuler.turbulence(dim=2, speed=1.0, size=0.5, modes=8).waves.shape
@@ -161,7 +179,8 @@ def turbulence(
     Source: R. H. Kraichnan, Diffusion by a Random Velocity Field, Phys. Fluids 13, 1970 (a sum of random waves).
     """
     if dim not in (2, 3):
-        raise ValueError(f"turbulence.dim must be 2 or 3, got {dim!r}")
+        raise ValueError(f"turbulence.dim must be 2 or 3, got {checks.shown(dim)}")
+    modes, seed = checks.count("turbulence.modes", modes, least=1), checks.count("turbulence.seed", seed)
     random = np.random.default_rng(seed)
     waves = random.normal(size=(modes, dim))
     waves *= (random.uniform(0.7, 1.3, size=modes) / np.linalg.norm(waves, axis=1))[:, None]
@@ -200,9 +219,13 @@ class Vortex:
     core: Parameter
     axis: Parameter = default((0.0, 0.0, 1.0))
 
+    limits: ClassVar = {"circulation": ("", "m^2/s"), "core": ("> 0", "m"), "axis": ("", "")}
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", moving(self.center))
+        object.__setattr__(self, "center", moving("Vortex.center", self.center))
         store_as_float(self, "circulation", "core", "axis")
+        check_limits(self)
+        checks.points_somewhere("Vortex.axis", self.axis)
 
     def __call__(self, t: Any, position: Array) -> Array:
         dtype = position.dtype

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from jeuler._core.annotations import MovingParameter, Parameter
 from jeuler._core.component import component, store_as_float
 from jeuler._core.components import mass_that_feels, per_particle
 from jeuler._core.in_time import at_time, moving
+from jeuler._core.limits import check_limits
 
 
 @component(static=("power",), positive=("softening",))
@@ -30,7 +31,8 @@ class PointAttractor:
       power: 2 for gravity, 1 for a line charge, 0 for the same pull at any distance. Static.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
       A pinned particle feels none.
-    Raises: ValueError, in `simulate`, if the center has another dim.
+    Raises: ValueError, if the softening is not above 0 or power is no number; in `simulate`, if the center has
+      another dim.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> sun = jeuler.PointAttractor([0.0, 0.0], strength=4.0, softening=1e-6)
@@ -45,10 +47,14 @@ class PointAttractor:
     softening: Parameter
     power: float = 2
 
+    limits: ClassVar = {"center": ("", "m"), "strength": ("", ""), "softening": ("> 0", "m")}
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", moving(self.center))
-        object.__setattr__(self, "strength", moving(self.strength))
+        object.__setattr__(self, "center", moving("PointAttractor.center", self.center))
+        object.__setattr__(self, "strength", moving("PointAttractor.strength", self.strength))
         store_as_float(self, "softening")
+        checks.number("PointAttractor.power", self.power)
+        check_limits(self)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         d = at_time(self.center, t, position.dtype) - position

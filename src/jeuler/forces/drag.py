@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -12,6 +12,7 @@ from jeuler._core import checks
 from jeuler._core.annotations import AirParameter, Parameter, default
 from jeuler._core.component import component, store_as_float
 from jeuler._core.components import split, stack
+from jeuler._core.limits import Limits, check_limits
 from jeuler._core.vectors import dot, total
 from jeuler.forces.air import air_velocity, as_air, check_air
 
@@ -127,6 +128,7 @@ class _Drag:
 
     def __post_init__(self) -> None:
         store_as_float(self, "coefficient")
+        check_limits(self)
         object.__setattr__(self, "air", as_air(self.air))
 
     def drag(self, t: Any, position: Array) -> Resistance:
@@ -162,7 +164,7 @@ class LinearDrag(_Drag):
       air: the velocity w of the air: None at rest, (dim,) m/s, a field such as `Wind`, `Gust`, `Vortex` or
         `turbulence(...)`, any function ``air(t, position) -> (particle, dim)``, or a tuple of these, which add up.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
-    Raises: ValueError, in `simulate`, if the coefficient or the air has another shape.
+    Raises: ValueError, in `simulate`, if the coefficient is negative, or it or the air has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> drag = jeuler.LinearDrag(0.5, air=[2.0, 0.0])
@@ -174,6 +176,8 @@ class LinearDrag(_Drag):
 
     coefficient: Parameter
     air: AirParameter = default(None)
+
+    limits: ClassVar[Limits] = {"coefficient": (">= 0", "kg/s")}
 
     def drag(self, t: Any, position: Array) -> Resistance:
         """What `simulate` must know of the drag so that a step does not overshoot."""
@@ -199,7 +203,7 @@ class QuadraticDrag(_Drag):
         `turbulence(...)`, any function ``air(t, position) -> (particle, dim)``, or a tuple of these, which add up.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
       At the speed of the air the force and its derivative are zero.
-    Raises: ValueError, in `simulate`, if the coefficient or the air has another shape.
+    Raises: ValueError, in `simulate`, if the coefficient is negative, or it or the air has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> jeuler.QuadraticDrag(0.5)(0.0, jnp.zeros((1, 2)), jnp.array([[3.0, 4.0]]), jnp.asarray(1.0)).tolist()
@@ -210,6 +214,8 @@ class QuadraticDrag(_Drag):
 
     coefficient: Parameter
     air: AirParameter = default(None)
+
+    limits: ClassVar[Limits] = {"coefficient": (">= 0", "kg/m")}
 
     def drag(self, t: Any, position: Array) -> Resistance:
         """What `simulate` must know of the drag so that a step does not overshoot."""

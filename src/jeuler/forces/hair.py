@@ -6,7 +6,7 @@ The stretch springs of a strand are ordinary `Springs` between neighbours (`stra
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices
 from jeuler._core.component import component, store_as_float
 from jeuler._core.indices import Indices
+from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
 
 
@@ -26,12 +27,18 @@ def strand_edges(strands: Any) -> np.ndarray:
     Args:
       strands: particle indices along each strand from its root, integers (strand, node).
     Returns: the pairs, integers (strand x (node - 1), 2).
+    Raises: ValueError, if strands is not an integer (strand, node) array.
     Example:
       >>> import jeuler
       >>> jeuler.strand_edges([[0, 1, 2], [3, 4, 5]]).tolist()
       [[0, 1], [1, 2], [3, 4], [4, 5]]
     """
-    strands = np.asarray(strands)
+    strands = checks.integers("strands", strands, "integers of shape (strand, node), particle indices")
+    if strands.ndim != 2 or strands.shape[1] < 2:
+        raise ValueError(
+            f"strands must have shape (strand, node) with two nodes at least, got {strands.shape}; "
+            f"for one strand write strand_edges([strand])"
+        )
     return np.stack([strands[:, :-1], strands[:, 1:]], axis=-1).reshape(-1, 2)
 
 
@@ -89,10 +96,19 @@ class _OnStrands:
     strands: Any
     rest_position: Array
 
+    limits: ClassVar = {
+        "rest_position": ("", "m"),
+        "stiffness": (">= 0", "N/m"),
+        "damping": (">= 0", "N s/m"),
+        "smoothing": ("> 0", "m"),
+    }
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "strands", Indices(self.strands))
+        name = f"{type(self).__name__}.strands"
+        object.__setattr__(self, "strands", Indices(self.strands, name, "integers of shape (strand, node)"))
         store_as_float(self, "rest_position", "stiffness", "damping", "smoothing")
         check_strands(type(self).__name__, self.strands, self.rest_position)
+        check_limits(self)
 
     def prepare(self, context: Any) -> Any:
         """Only strands that live as a whole: a strand of which a node died has no bending and no core."""
@@ -218,4 +234,5 @@ def check_strands(name: str, strands: Any, rest_position: Array) -> None:
         raise ValueError(
             f"{name}.strands must have shape (strand, node) with three nodes at least, got {indices.shape}"
         )
+    checks.different(f"{name}.strands", indices, "particles")
     checks.shape(f"{name}.rest_position", rest_position.shape, (*indices.shape, 3))

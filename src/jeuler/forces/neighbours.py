@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +12,7 @@ from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices, default
 from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.indices import Indices
+from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
 from jeuler.graphs.topology import Topology
 
@@ -28,7 +29,8 @@ class Viscosity:
       edges: the two particles of each pair, integers (pair, 2). Static.
       coefficient: c, shape () or (pair,), N s/m. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
-    Raises: ValueError, if edges is not an integer (pair, 2) array; in `simulate`, if an index is out of range.
+    Raises: ValueError, if edges is not an integer (pair, 2) array or the coefficient is negative; in `simulate`, if an
+      index is out of range.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> v = jnp.array([[1.0, 0.0], [0.0, 0.0]])
@@ -41,9 +43,12 @@ class Viscosity:
     edges: ParticleIndices
     coefficient: Parameter
 
+    limits: ClassVar = {"coefficient": (">= 0", "N s/m")}
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
         store_as_float(self, "coefficient")
+        check_limits(self)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         c = self.coefficient.astype(position.dtype)
@@ -83,7 +88,8 @@ class Bending:
       rest_angle: () or (triple,), rad. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
       It sums to zero and has no torque.
-    Raises: ValueError, if triples is not an integer (triple, 3) array; in `simulate`, if an index is out of range.
+    Raises: ValueError, if triples is not an integer (triple, 3) array or names a particle twice, or the stiffness is
+      negative; in `simulate`, if an index is out of range.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> corner = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
@@ -97,14 +103,16 @@ class Bending:
     stiffness: Parameter
     rest_angle: Parameter = default(0.0)
 
+    limits: ClassVar = {"stiffness": (">= 0", "N m/rad^2"), "rest_angle": ("", "rad")}
+
     def __post_init__(self) -> None:
-        triples = np.asarray(self.triples)
-        if triples.ndim != 2 or triples.shape[1] != 3 or not np.issubdtype(triples.dtype, np.integer):
-            raise ValueError(
-                f"Bending.triples must be integers of shape (triple, 3), got {triples.dtype} {triples.shape}"
-            )
-        object.__setattr__(self, "triples", Indices(triples))
+        triples = Indices(self.triples, "Bending.triples", "integers of shape (triple, 3), particle indices")
+        if len(triples.shape) != 2 or triples.shape[1] != 3:
+            raise ValueError(f"Bending.triples must be integers of shape (triple, 3), got {triples.shape}")
+        checks.different("Bending.triples", triples.indices, "particles, (i, j, k) with j in the middle")
+        object.__setattr__(self, "triples", triples)
         store_as_float(self, "stiffness", "rest_angle")
+        check_limits(self)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         i, j, k = np.asarray(self.triples).T

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices, default
 from jeuler._core.component import component, store_as_float
 from jeuler._core.indices import Indices
+from jeuler._core.limits import check_limits
 
 
 @jax.custom_jvp
@@ -86,7 +87,8 @@ class ShapeMatching:
       stiffness: (), N/m. Differentiable.
       damping: (), N s/m, of the motion within the body. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
-    Raises: ValueError, if the rest shape and the indices disagree; in `simulate`, if an index is out of range.
+    Raises: ValueError, if the rest shape and the indices disagree, an index stands twice or a number is
+      negative; in `simulate`, if an index is out of range.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> square = jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -103,14 +105,22 @@ class ShapeMatching:
     stiffness: Parameter
     damping: Parameter = default(0.0)
 
+    limits: ClassVar = {"rest_position": ("", "m"), "stiffness": (">= 0", "N/m"), "damping": (">= 0", "N s/m")}
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "particles", Indices(np.asarray(self.particles).reshape(-1)))
+        given = list(self.particles) if isinstance(self.particles, range) else self.particles
+        body = Indices(given, "ShapeMatching.particles")
+        if len(body.shape) != 1:
+            raise ValueError(f"ShapeMatching.particles must have shape (body particle,), got {body.shape}")
+        checks.different("ShapeMatching.particles", body.indices, "particles")
+        object.__setattr__(self, "particles", body)
         store_as_float(self, "rest_position", "stiffness", "damping")
         if self.rest_position.ndim != 2 or len(self.rest_position) != len(self.particles):
             raise ValueError(
                 f"ShapeMatching.rest_position must have shape ({len(self.particles)}, dim), one place for each of the "
                 f"body's particles, got {self.rest_position.shape}"
             )
+        check_limits(self)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, *, alive: Array | None = None) -> Array:
         body, dtype = np.asarray(self.particles), position.dtype

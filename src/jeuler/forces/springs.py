@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices
 from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.components import split, stack
+from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
 from jeuler.graphs.layouts import Layout
@@ -89,6 +90,8 @@ class Springs:
     kd: Parameter
     rest_length: Parameter
 
+    limits: ClassVar = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
         store_as_float(self, "ks", "kd", "rest_length")
@@ -119,10 +122,10 @@ class Springs:
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
-        for name, unit in (("ks", "N/m"), ("kd", "N s/m"), ("rest_length", "m")):
+        for name in ("ks", "kd", "rest_length"):
             shape = getattr(self, name).shape
             checks.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
-            checks.not_negative(f"Springs.{name}", getattr(self, name), unit)
+        check_limits(self)
 
 
 @component(static=("edges", "layouts"))

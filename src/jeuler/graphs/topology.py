@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jeuler._core import checks
 from jeuler._core.indices import Indices
 from jeuler.graphs.layouts import Layout, Pairs, Rows, Shifts
 
@@ -29,19 +30,17 @@ class Topology(Indices):
     """
 
     def __init__(self, edges: Any) -> None:
-        edges = np.asarray(edges) if np.size(edges) else np.zeros((0, 2), np.int32)
+        edges = checks.integers("edges", edges, "integers of shape (spring, 2), particle indices")
+        edges = edges if edges.size else np.zeros((0, 2), np.int32)
         if edges.ndim != 2 or edges.shape[1] != 2:
-            raise ValueError(f"edges must have shape (spring, 2), got {edges.shape}")
-        if not np.issubdtype(edges.dtype, np.integer):
-            raise ValueError(f"edges must be integers, particle indices, got {edges.dtype}")
+            hint = "; turn it round, edges.T" if edges.ndim == 2 and edges.shape[0] == 2 else ""
+            raise ValueError(f"edges must have shape (spring, 2), got {edges.shape}{hint}")
         loops = np.flatnonzero(edges[:, 0] == edges[:, 1])
         if loops.size:
             raise ValueError(
-                f"edges must join two different particles, got edges[{loops[0]}] = {edges[loops[0]].tolist()}"
+                f"edges must join two different particles, got edges[{loops[0]}] = {edges[loops[0]].tolist()}; "
+                f"take that edge out"
             )
-        if edges.min(initial=0) < 0:
-            where = int(np.argmin(edges.min(axis=1)))
-            raise ValueError(f"edges must be particle indices from 0, got edges[{where}] = {edges[where].tolist()}")
         super().__init__(edges)
 
     def check(self, particles: int) -> None:

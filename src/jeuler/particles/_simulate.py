@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,9 +11,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.calls import with_previous
 from jeuler._core.component import Function, replace
 from jeuler._core.components import per_particle
+from jeuler._core.limits import check_parameters
 from jeuler._jax import programs
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import START, acts, declared, name_of, with_required_fields
@@ -21,10 +24,23 @@ from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
 from jeuler.particles.step import SceneStep
 from jeuler.particles.windows import in_windows
-from jeuler.solving._scan import Checkpoint, Grid, Solution, check_step, no_remainder, scan_grid, solve_reversibly
+from jeuler.solving._scan import (
+    INSTEAD,
+    Checkpoint,
+    Grid,
+    Solution,
+    check_save,
+    check_step,
+    no_remainder,
+    scan_grid,
+    solve_reversibly,
+)
 from jeuler.steps.explicit import Step, euler_step
 
+ON_A_SCENE = {"args": "the mass with the state, state.replace(mass=...)", "mass": "state.replace(mass=...)"}
 
+
+@says_what_to_write(**INSTEAD | ON_A_SCENE)
 def simulate(
     scene: Scene,
     state: ParticleState,
@@ -50,7 +66,7 @@ def simulate(
     Args:
       scene: forces and effects. Differentiable.
       state: initial state of the particles. Differentiable. A pinned particle's velocity counts as zero.
-      dt: step size, > 0, s. Differentiable.
+      dt: step size, s; negative steps back in time, where no effect forbids it. Differentiable.
       num_steps: number of steps, an integer >= 0.
       t0: initial time, s.
       step: the method, as in `solve`.
@@ -74,7 +90,14 @@ def simulate(
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
     grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint)
+    check_step(step)
+    check_save(save)
+    checks.true_or_false("compensated", compensated)
+    check_parameters("scene", scene)
     inputs = scene, state, grid, key, Function(step), Function(save)
+    if not isinstance(windows, (str, tuple, list)):
+        came = checks.shown(windows)
+        raise ValueError(f'windows must be "auto" or a tuple of sizes, got {came}; write windows=({came},)')
     settings = checkpoint, compensated, windows if isinstance(windows, str) else tuple(windows)
     if checkpoint == "reversible":  # looks at values
         return _simulate(*inputs, *settings)
@@ -119,12 +142,40 @@ def check_run(
     checkpoint: Checkpoint = None,
 ) -> Grid:
     """Every check that looks at values, of these arguments of `simulate`: made at each call, traced or not."""
-    checks.kind("scene", scene, Scene)
-    checks.kind("state", state, ParticleState)
+    check_kinds(scene, state)
     checks.random_key(key)
     state.check()
     scene.check(state)
+    dt = forwards(scene, dt)
     return Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(state.position))
+
+
+def check_kinds(scene: Any, state: Any) -> None:
+    """One ValueError if the first two arguments are not a scene and a state."""
+    if isinstance(scene, ParticleState) and isinstance(state, Scene):
+        raise ValueError("scene comes first, then state, got them swapped; write simulate(scene, state, ...)")
+    if not isinstance(scene, Scene):
+        hint = "write Scene(forces=(...,), effects=(...,))"
+        raise ValueError(f"scene must be a Scene, got {checks.shown(scene)}; {hint}")
+    if not isinstance(state, ParticleState):
+        hint = "write ParticleState(position, velocity, mass=...)"
+        raise ValueError(f"state must be a ParticleState, got {checks.shown(state)}; {hint}")
+
+
+def forwards(scene: Scene, dt: Any) -> Any:
+    """dt, where the scene can run backwards or dt is above 0; else one ValueError, or NaN where dt is traced."""
+    one_way = [name_of(effect) for effect in scene.effects if declared(effect, "forward_only", False)]
+    if not one_way:
+        return dt
+    checks.number("dt", dt)
+    if checks.is_traced(dt):
+        return jnp.where(dt < 0, jnp.nan, dt)
+    if float(dt) < 0:
+        raise ValueError(
+            f"dt must be greater than 0 s with {one_way[0]}, which cannot be undone, got {float(dt):g} s; "
+            f"only forces and prescribed motion run backwards in time"
+        )
+    return dt
 
 
 def first_step(
@@ -135,7 +186,7 @@ def first_step(
     state = with_required_fields(state, scene.forces, scene.effects)
     state = _at_start(scene, state, grid, key)
     motion = checks.state("state", (state.position, state.velocity))
-    form = jax.eval_shape(scene.vector_field, grid.t0, motion, scene.attributes(state))
+    form = checks.form_of("the sum of forces", scene.vector_field, grid.t0, motion, scene.attributes(state))
     checks.same_form("the sum of forces", motion, form)
     _check_effects(scene, state, grid, key)
     return SceneStep.of(scene, state, grid, step, key, **how), state
@@ -179,7 +230,8 @@ def _check_effects(scene: Scene, state: ParticleState, grid: Grid, key: Array | 
             raise ValueError(
                 f"simulate needs a key, because {name_of(effect)} draws random numbers; pass key=jax.random.key(0)"
             )
-        after = jax.eval_shape(with_previous(effect, ""), grid.t0, grid.dt, state, state, key=key)
+        act = functools.partial(with_previous(effect, ""), key=key)
+        after = checks.form_of(name_of(effect), act, grid.t0, grid.dt, state, state)
         if not isinstance(after, ParticleState):
             raise ValueError(f"{name_of(effect)} must return the state, a ParticleState, got {type(after).__name__}")
         added = set(after.fields()) ^ set(state.fields())

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
+from jeuler._core import checks
 from jeuler._core.component import component
 from jeuler._core.components import by_component, split, stack
 from jeuler._core.vectors import total
@@ -128,7 +129,9 @@ class Equation:
                 yield Share(name, drag.force(v), drag)
             else:
                 fields = {field: attributes.field(field, name) for field in reads}
-                yield Share(name, split(kernel(t, stack(x), stack(v), mass, **fields)), None)
+                position = stack(x)
+                force = checked_force(name, kernel(t, position, stack(v), mass, **fields), position.shape)
+                yield Share(name, split(force), None)
 
     def net_force(self, t: Any, x: Any, v: Any, attributes: Attributes) -> tuple[list[Array], Array]:
         """The sum of forces by component, and the mass that it acts on, kg."""
@@ -141,6 +144,20 @@ class Equation:
             others = [stored(component) for component in others]
         mass = inertia(attributes.mass, jnp.asarray(self.context.dt), drags, v, others)
         return add([others, *(share.force for share in shares if share.drag is not None)], x), mass
+
+
+def checked_force(name: str, force: Any, shape: tuple[int, ...]) -> Array:
+    """What a force returned, if it is one force a particle."""
+    came = getattr(force, "shape", None)
+    if came != shape:
+        hint = "write jnp.broadcast_to(force, position.shape) for the same force on all"
+        if came == shape[:1]:
+            hint = "a number for each particle is no vector, write force[:, None] * direction"
+        raise ValueError(
+            f"{name} must return the force on each particle, (particle, dim) = {shape}, "
+            f"got {'shape ' + str(came) if came is not None else checks.shown(force)}; {hint}"
+        )
+    return force
 
 
 def add(forces: Sequence[Sequence[Array]], like: Sequence[Array]) -> list[Array]:

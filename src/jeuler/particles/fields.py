@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, TypeVar
 
+from jeuler._core import checks
 from jeuler._core.component import unwrapped
 from jeuler.particles.state import ParticleState, with_default_fields
 
@@ -34,7 +35,8 @@ def uses(
       acts: when an effect acts: "before motion", "after motion", as without a word, or "start and after motion", once
         before the first step as well.
     Returns: a decorator that gives the function back, with these as its attributes.
-    Raises: ValueError, if acts is none of these; in `simulate`, if nothing provides a field that is read, or two
+    Raises: ValueError, if acts is none of these; in `simulate`, if nothing
+      provides a field that is read, or two
       effects write one in conflict.
     Example:
       >>> import jeuler
@@ -47,6 +49,14 @@ def uses(
 
     if acts not in (None, *ACTS):
         raise ValueError(f"acts must be one of {', '.join(map(repr, ACTS))}, got {acts!r}")
+
+    for what, names in (("reads", reads), ("writes", writes), ("sets", sets)):
+        if isinstance(names, str) or not isinstance(names, (tuple, list)) or any(not isinstance(n, str) for n in names):
+            raise ValueError(
+                f"uses.{what} must be a tuple of names of fields, got {checks.shown(names)}; "
+                f'write {what}=("temperature",)'
+            )
+    checks.true_or_false("uses.before_motion", before_motion)
 
     def decorate(function: F) -> F:
         when = acts or (BEFORE if before_motion else AFTER)

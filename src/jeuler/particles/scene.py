@@ -120,12 +120,21 @@ def _check_part(name: str, part: Any) -> None:
     expected = f"Scene.{name} must hold functions such as Gravity(...) or Lifetime(...)"
     checks.refuse_class(expected, part)
     if not callable(part):
-        raise ValueError(f"{expected}, got {part!r}")
+        hint = "; a collider acts through Collisions((...,)) or PenaltyContact" if hasattr(part, "normal") else ""
+        raise ValueError(f"{expected}, got {checks.shown(part)}{hint}")
     signature = checks.signature_of(part)
     arguments = set(signature.parameters) if signature else set()
     if name == "forces" and {"dt", "state"} <= arguments:
         raise ValueError(f"{name_of(part)} is an effect, (t, dt, state, key) -> state; put it in Scene.effects")
     if name == "effects" and {"position", "velocity"} <= arguments:
         raise ValueError(f"{name_of(part)} is a force, (t, position, velocity, mass) -> N; put it in Scene.forces")
+    if name == "forces" and signature and not hasattr(part, "prepare"):
+        try:
+            signature.bind(*[None] * 4, **dict.fromkeys(declared(part, "reads")))
+        except TypeError:
+            raise ValueError(
+                f"Scene.forces must hold functions (t, position, velocity, mass) -> N, got {name_of(part)}{signature}; "
+                f"all four arguments are passed, also those that it does not need"
+            ) from None
     if name == "effects":
         with_previous(part, name_of(part))

@@ -12,6 +12,7 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.annotations import OptionalParameter, Parameter, default
+from jeuler._core.arguments import near_name, says_what_to_write
 from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.components import by_component, split, stack
 
@@ -49,6 +50,7 @@ class ParticleState:
       births: () int32, the number of particles born since the start.
       missed_births: () int32, the births that found no free slot.
       extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
+    Raises: ValueError, if a field is not an array of numbers; `simulate` checks the shapes.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.zeros((3, 2)), mass=[jnp.inf, 1.0, 1.0])
@@ -76,13 +78,15 @@ class ParticleState:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name == "extra":
-                value = value and {name: jnp.asarray(x) for name, x in value.items()}
+                if not isinstance(value, (dict, type(None))):
+                    raise ValueError(
+                        f"ParticleState.extra must be a dict of arrays by name, got {checks.shown(value)}; "
+                        f'write extra={{"temperature": values}}'
+                    )
+                value = value and {name: _array(f"extra[{name!r}]", x) for name, x in value.items()}
                 object.__setattr__(self, "extra", value or None)
-            elif value is not None and not isinstance(value, jax.Array):
-                try:
-                    object.__setattr__(self, field.name, jnp.asarray(value))
-                except (TypeError, ValueError):
-                    raise ValueError(f"ParticleState.{field.name} must be an array of numbers, got {value!r}") from None
+            elif value is not None:
+                object.__setattr__(self, field.name, _array(field.name, value))
         if isinstance(self.mass, jax.Array) and jnp.issubdtype(self.mass.dtype, jnp.integer):
             store_as_float(self, "mass")
 
@@ -99,9 +103,19 @@ class ParticleState:
         return (*own, *(there.get("extra") or {}))
 
     def replace(self, **values: Any) -> ParticleState:
-        """A state with these fields instead; a name that is not a field of its own goes to ``extra``."""
+        """A state with these fields instead; a name that is not a field of its own goes to ``extra``.
+
+        One that is nearly the name of a field is taken for a slip and refused; give such a field with ``extra={...}``.
+        """
         own = {f.name for f in dataclasses.fields(self)}
         extra = {name: x for name, x in values.items() if name not in own}
+        for name in extra:
+            near = None if name in (self.extra or {}) else near_name(name, (*own, *(self.extra or {})), cutoff=0.8)
+            if near:
+                raise ValueError(
+                    f"the state has no field {name!r}; did you mean {near}=...? "
+                    f"For a further field of that name write extra={{{name!r}: ...}}"
+                )
         if extra:
             values = {name: x for name, x in values.items() if name in own}
             values["extra"] = {**(self.extra or {}), **extra}
@@ -109,6 +123,9 @@ class ParticleState:
 
     def check(self) -> None:
         """Shapes, dtypes and masses that a run can use; one ValueError that says which cannot."""
+        for name in ("position", "velocity", "mass"):
+            if getattr(self, name) is None:
+                raise ValueError(f"state.{name} must be an array of numbers, got None; every particle has one")
         for name in ("position", "velocity"):
             x = getattr(self, name)
             if not jnp.issubdtype(x.dtype, jnp.floating):
@@ -126,9 +143,11 @@ class ParticleState:
             raise ValueError(
                 f"state.velocity must have the dtype of position, {self.position.dtype}, got {self.velocity.dtype}"
             )
+        if not jnp.issubdtype(self.mass.dtype, jnp.floating):
+            raise ValueError(f"state.mass must be real numbers in kg, got {self.mass.dtype}; inf pins a particle")
         checks.shape("state.mass", self.mass.shape, (), shape[:1], meaning="one a particle")
         if not checks.is_traced(self.mass):
-            mass = np.asarray(self.mass).ravel()
+            mass = np.asarray(self.mass).astype(self.position.dtype).ravel()
             bad = np.flatnonzero(~(mass > 0))
             if bad.size:
                 raise ValueError(
@@ -139,7 +158,9 @@ class ParticleState:
 
     def _check_fields(self, particles: int) -> None:
         for name in self.fields():
-            shape = getattr(self, name).shape
+            shape, dtype = getattr(self, name).shape, getattr(self, name).dtype
+            if name in DEFAULTS and isinstance(DEFAULTS[name][1], float) and not jnp.issubdtype(dtype, jnp.floating):
+                raise ValueError(f"state.{name} must be floating, got {dtype}; convert it, jnp.asarray(x, dtype=float)")
             if name in DEFAULTS:
                 checks.shape(f"state.{name}", shape, (particles, *DEFAULTS[name][0]))
             if name in (self.extra or {}) and shape[:1] not in ((), (particles,)):
@@ -150,6 +171,17 @@ class ParticleState:
             )
 
 
+def _array(name: str, value: Any) -> Array:
+    """A field as an array of numbers; one ValueError if it is none."""
+    if isinstance(value, jax.Array):
+        return value
+    try:
+        return jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"ParticleState.{name} must be an array of numbers, got {checks.shown(value)}") from None
+
+
+@says_what_to_write()
 def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -> ParticleState:
     """A pool of free slots, all dead, for an `Emitter` to fill.
 
@@ -159,7 +191,7 @@ def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -
       mass: mass of each particle, () or (capacity,), kg.
       dtype: precision of position and velocity; None means JAX's default float.
     Returns: a `ParticleState` with ``alive`` False everywhere.
-    Raises: ValueError, if the capacity or the dimension is not a positive integer.
+    Raises: ValueError, if the capacity or the dimension is not a positive integer, or dtype is not floating.
     Example:
       >>> import jeuler
       >>> pool = jeuler.empty_pool(100, dim=3)
@@ -167,6 +199,12 @@ def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -
       ((100, 3), 0)
     """
     capacity, dim = checks.count("capacity", capacity, least=1), checks.count("dim", dim, least=1)
+    try:
+        kind = jnp.dtype(dtype or float)
+    except TypeError:
+        raise ValueError(f"dtype must be a floating dtype such as jnp.float32, got {checks.shown(dtype)}") from None
+    if not jnp.issubdtype(kind, jnp.floating):
+        raise ValueError(f"dtype must be floating, got {kind}; write jnp.float32 or None")
     zeros = jnp.zeros((capacity, dim), dtype or float)
     return ParticleState(zeros, zeros, mass=mass, alive=jnp.zeros(capacity, bool))
 

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 from jax import Array
 
+from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.components import split, stack
 from jeuler.particles.equation import Equation
@@ -111,6 +112,9 @@ def on_arrays(step: Step) -> Step:
         def on_arrays(t, y, attributes):
             return tuple(map(stack, f(t, tuple(map(split, y)), attributes)))
 
-        return tuple(map(split, step(on_arrays, t, tuple(map(stack, motion)), dt, attributes)))
+        arrays = tuple(map(stack, motion))
+        after = step(on_arrays, t, arrays, dt, attributes)
+        checks.same_form("the step", arrays, after)
+        return tuple(map(split, after))
 
     return functools.wraps(step)(by_components)

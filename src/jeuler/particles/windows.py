@@ -69,6 +69,8 @@ def checked_sizes(sizes: tuple[int, ...] | str, capacity: int, scene: Any, state
     """The sizes, if they increase and every force and effect can work on a part of the slots; or one ValueError."""
     if isinstance(sizes, str):
         raise ValueError(f'windows must be "auto" or sizes in increasing order, got {sizes!r}')
+    if not isinstance(sizes, (tuple, list)):
+        raise ValueError(f'windows must be "auto" or a tuple of sizes, got {sizes!r}; write windows=({sizes!r},)')
     sizes = tuple(sizes)
     if any(not isinstance(size, int) or size < 1 for size in sizes) or list(sizes) != sorted(set(sizes)):
         raise ValueError(f"windows must be positive integers in increasing order, got {sizes}")

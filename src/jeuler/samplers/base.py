@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter
 from jeuler._core.component import as_component, as_float, component, store_as_float
+from jeuler._core.limits import check_limits
 from jeuler._jax import random_rows
 
 
@@ -64,7 +65,12 @@ def as_sampler(name: str, x: Any) -> Any:
     """A sampler as a pytree of floating arrays; numbers and arrays become arrays, None stays."""
     checks.refuse_class(f"{name} must be a sampler or a value", x)
     if not callable(x):
-        return as_float(x)
+        try:
+            return as_float(x)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{name} must be a sampler such as Uniform(...), a number or an array, got {checks.shown(x)}"
+            ) from None
     checks.function(name, x, "(key, count) -> (count, ...)", "a sampler draws all newborns at once")
     return as_component(x)
 
@@ -77,8 +83,9 @@ class Uniform(Sampler):
 
     Args:
       low: () or (component,). Differentiable.
-      high: () or (component,). Differentiable.
+      high: () or (component,), not below low. Differentiable.
     Returns: called as ``sampler(key, count)``, (count,) or (count, component).
+    Raises: ValueError, if low is above high, or their shapes do not fit together.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.Uniform(1.0, 2.0)(jax.random.key(0), 100)
@@ -89,8 +96,13 @@ class Uniform(Sampler):
     low: Parameter
     high: Parameter
 
+    limits: ClassVar = {"low": ("", ""), "high": ("", "")}
+
     def __post_init__(self) -> None:
         store_as_float(self, "low", "high")
+        checks.fit_together("Uniform", low=self.low, high=self.high)
+        checks.in_order("Uniform.low", self.low, "Uniform.high", self.high)
+        check_limits(self)
 
     @property
     def numbers(self) -> int:
@@ -109,8 +121,9 @@ class Normal(Sampler):
 
     Args:
       mean: () or (component,). Differentiable.
-      deviation: standard deviation, () or (component,). Differentiable.
+      deviation: standard deviation, () or (component,), >= 0. Differentiable.
     Returns: called as ``sampler(key, count)``, (count,) or (count, component).
+    Raises: ValueError, if a deviation is negative, or the shapes do not fit together.
     Example:
       >>> import jax, jeuler
       >>> jeuler.Normal([0.0, 1.0], 0.1)(jax.random.key(0), 5).shape
@@ -123,8 +136,12 @@ class Normal(Sampler):
     mean: Parameter
     deviation: Parameter
 
+    limits: ClassVar = {"mean": ("", ""), "deviation": (">= 0", "")}
+
     def __post_init__(self) -> None:
         store_as_float(self, "mean", "deviation")
+        checks.fit_together("Normal", mean=self.mean, deviation=self.deviation)
+        check_limits(self)
 
     @property
     def numbers(self) -> int:
@@ -142,6 +159,7 @@ class Choice(Sampler):
     Args:
       values: (choice, ...). Differentiable; which row is drawn is not.
     Returns: called as ``sampler(key, count)``, (count, ...).
+    Raises: ValueError, if there is no row to choose from.
     Example:
       >>> import jax, jeuler
       >>> sorted(set(jeuler.Choice([1.0, 5.0])(jax.random.key(0), 50).tolist()))
@@ -152,6 +170,8 @@ class Choice(Sampler):
 
     def __post_init__(self) -> None:
         store_as_float(self, "values")
+        if not self.values.ndim or not len(self.values):
+            raise ValueError(f"Choice.values must have shape (choice, ...), one row at least, got {self.values.shape}")
 
     numbers = 1
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, SampledParameter, default
 from jeuler._core.component import component, store_as_float
+from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
 from jeuler.samplers.base import Sampler, as_sampler, numbers_of, standard_normal
 
@@ -24,6 +27,7 @@ class FromLine(Sampler):
       start: (dim,), m. Differentiable.
       end: (dim,), m. Differentiable.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: ValueError, if start or end is not one point, (dim,).
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.FromLine([0.0, 1.0], [2.0, 1.0])(jax.random.key(0), 3)
@@ -36,6 +40,7 @@ class FromLine(Sampler):
 
     def __post_init__(self) -> None:
         store_as_float(self, "start", "end")
+        check_points("FromLine", start=self.start, end=self.end)
 
     numbers = 1
 
@@ -51,9 +56,10 @@ class FromDisc(Sampler):
 
     Args:
       center: (dim,), m, dim 2 or 3. Differentiable.
-      radius: (), m. Differentiable.
+      radius: (), m, >= 0. Differentiable.
       normal: (3,), the axis of a disc in space; ignored in the plane.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: ValueError, if the center is not one point, the radius is negative or the normal is 0.
     Example:
       >>> import jax, jeuler
       >>> x = jeuler.FromDisc([0.0, 0.0, 5.0], 1.0)(jax.random.key(0), 4)
@@ -68,8 +74,14 @@ class FromDisc(Sampler):
     radius: Parameter
     normal: Parameter = default((0.0, 0.0, 1.0))
 
+    limits: ClassVar = {"center": ("", "m"), "radius": (">= 0", "m"), "normal": ("", "")}
+
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius", "normal")
+        check_points("FromDisc", center=self.center)
+        checks.shape("FromDisc.center", self.center.shape[-1:], (2,), (3,))
+        checks.points_somewhere("FromDisc.normal", self.normal)
+        check_limits(self)
 
     numbers = 2
 
@@ -90,9 +102,10 @@ class FromSphere(Sampler):
 
     Args:
       center: (dim,), m. Differentiable.
-      radius: (), m. Differentiable.
+      radius: (), m, >= 0. Differentiable.
       surface: True draws from the surface only.
     Returns: called as ``sampler(key, count)``, (count, dim), m.
+    Raises: ValueError, if the center is not one point or the radius is negative.
     Example:
       >>> import jax, jax.numpy as jnp, jeuler
       >>> x = jeuler.FromSphere([0.0, 0.0, 0.0], 2.0, surface=True)(jax.random.key(0), 4)
@@ -106,8 +119,13 @@ class FromSphere(Sampler):
     radius: Parameter
     surface: bool = False
 
+    limits: ClassVar = {"center": ("", "m"), "radius": (">= 0", "m")}
+
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius")
+        check_points("FromSphere", center=self.center)
+        checks.true_or_false("FromSphere.surface", self.surface)
+        check_limits(self)
 
     @property
     def numbers(self) -> int:
@@ -144,9 +162,11 @@ class FromSurface(Sampler):
 
     def __post_init__(self) -> None:
         store_as_float(self, "vertices")
-        faces = np.asarray(self.faces)
-        if faces.shape[1:] != (3,) or not faces.size or not np.issubdtype(faces.dtype, np.integer):
-            raise ValueError(f"FromSurface.faces must be integers of shape (face, 3), got {faces.dtype} {faces.shape}")
+        if self.vertices.ndim < 2:
+            raise ValueError(f"FromSurface.vertices must have shape (vertex, dim), got {self.vertices.shape}")
+        faces = checks.integers("FromSurface.faces", self.faces, "integers of shape (face, 3)")
+        if faces.shape[1:] != (3,) or not faces.size:
+            raise ValueError(f"FromSurface.faces must be integers of shape (face, 3), got {faces.shape}")
         checks.indices("FromSurface.faces", faces, len(self.vertices))
         object.__setattr__(self, "faces", tuple(map(tuple, faces.tolist())))
 
@@ -173,8 +193,9 @@ class Cone(Sampler):
     Args:
       direction: the axis, (dim,), any length, dim 2 or 3. Differentiable.
       speed: (), m/s, or a sampler of it. Differentiable.
-      angle: half the opening angle, (), rad; pi is every direction. Differentiable.
+      angle: half the opening angle, (), rad, >= 0; pi is every direction. Differentiable.
     Returns: called as ``sampler(key, count)``, (count, dim), m/s.
+    Raises: ValueError, if the direction is 0 or not (dim,), or the angle is negative.
     Example:
       >>> import jax, jeuler
       >>> jet = jeuler.Cone([0.0, 0.0, 1.0], speed=jeuler.Uniform(4.0, 6.0), angle=0.2)
@@ -189,9 +210,17 @@ class Cone(Sampler):
     speed: SampledParameter
     angle: Parameter = default(0.0)
 
+    limits: ClassVar = {"direction": ("", ""), "angle": (">= 0", "rad")}
+
     def __post_init__(self) -> None:
         store_as_float(self, "direction", "angle")
         object.__setattr__(self, "speed", as_sampler("Cone.speed", self.speed))
+        if self.speed is None:
+            raise ValueError("Cone.speed must be a speed in m/s or a sampler of it, got None")
+        check_points("Cone", direction=self.direction)
+        checks.shape("Cone.direction", self.direction.shape[-1:], (2,), (3,))
+        checks.points_somewhere("Cone.direction", self.direction)
+        check_limits(self)
 
     @property
     def numbers(self) -> int | None:
@@ -222,6 +251,15 @@ class Cone(Sampler):
         sine = jnp.sqrt(u[0]) * 2 * jnp.sin(self.angle / 2) * jnp.sqrt(1 - down / 2)
         around = 2 * jnp.pi * u[1]
         return speed * ((1 - down) * axis + sine * (jnp.cos(around) * first + jnp.sin(around) * second))
+
+
+def check_points(name: str, **points: Array) -> None:
+    """Each of these is a finite point or vector, (dim,), or a batch of them for ``vmap``, and all have the same dim."""
+    first = next(iter(points.values())).shape[-1:]
+    for field, x in points.items():
+        if not x.ndim or x.shape[-1:] != first:
+            raise ValueError(f"{name}.{field} must have shape {first or '(dim,)'}, got {x.shape}")
+        checks.finite(f"{name}.{field}", x)
 
 
 def frame(axis: Array) -> tuple[Array, Array, Array]:

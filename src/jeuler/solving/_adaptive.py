@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import Function, component
 from jeuler._core.partition import arrays_only
 from jeuler._jax import programs
@@ -50,6 +51,7 @@ class AdaptiveSolution:
     _repr_html_ = adaptive_table
 
 
+@says_what_to_write(dt="dt0=..., the first step to try", num_steps="t1=...", save_every="t1=[...], where to stop")
 def solve_adaptive(
     f: VectorField,
     y0: PyTree,
@@ -127,7 +129,7 @@ def _solve_adaptive(
 ) -> AdaptiveSolution:
     """`solve_adaptive`, as it is compiled."""
     f, step = field.function, stepper.function
-    checks.same_form("the vector field f", y0, jax.eval_shape(f, t0, y0, args))
+    checks.vector_field(f, t0, y0, args)
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -13,8 +14,9 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import Function, component
-from jeuler._core.partition import OfArrays, arrays_only
+from jeuler._core.partition import arrays_only
 from jeuler._jax import programs
 from jeuler._jax.members import recomputed
 from jeuler.solving._reversible import check as check_reversible
@@ -23,6 +25,20 @@ from jeuler.solving._tables import solution_table
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
+INSTEAD = {
+    "t1": "num_steps=round((t1 - t0) / dt), the end is at t0 + num_steps * dt",
+    "steps": "num_steps=...",
+    "n": "num_steps=...",
+    "h": "dt=...",
+    "method": "step=jeuler.rk4_step",
+    "solver": "step=jeuler.rk4_step",
+    "saveat": "save_every=...",
+    "ts": "save_every=...",
+    "callback": "save=lambda t, y: ...",
+    "mass": "args=mass",
+    "rng": "key=jax.random.key(0)",
+    "seed": "key=jax.random.key(0)",
+}
 Checkpoint = int | Literal["sqrt", "reversible"] | None
 
 
@@ -46,9 +62,19 @@ class Solution:
     y: PyTree
     first_nonfinite: Array
 
+    def __getattr__(self, name: str) -> Any:
+        own = ("t", "y", "first_nonfinite")
+        state = self.__dict__.get("y")
+        if name in ("position", "velocity", *getattr(state, "fields", tuple)()):
+            raise AttributeError(f"a Solution has no {name!r} of its own; write solution.y.{name}, (saved, ...)")
+        instead = {"times": "t", "time": "t", "ts": "t", "ys": "y", "states": "y", "state": "y", "success": own[2]}
+        hint = f"; write solution.{instead[name]}" if name in instead else ""
+        raise AttributeError(f"a Solution has {', '.join(own)}, got {name!r}{hint}")
+
     _repr_html_ = solution_table
 
 
+@says_what_to_write(**INSTEAD)
 def solve(
     f: VectorField,
     y0: PyTree,
@@ -73,7 +99,7 @@ def solve(
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``, of the structure, shapes and dtypes of y.
       y0: initial state, any pytree of floating or complex arrays. Differentiable.
-      dt: step size, > 0, s. Differentiable.
+      dt: step size, s; negative steps back in time. Differentiable.
       num_steps: number of steps, an integer >= 0.
       t0: initial time, s. Differentiable.
       args: passed to f; any pytree. Its arrays and floats are differentiable; other leaves, such as functions, strings
@@ -102,6 +128,10 @@ def solve(
     """
     y0 = checks.state("y0", y0)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0))
+    checks.field_form(f)
+    check_step(step)
+    check_save(save)
+    checks.true_or_false("compensated", compensated)
     f, args = arrays_only(f, args)
     inputs, settings = (Function(f), y0, args, grid, Function(step), Function(save)), (checkpoint, compensated)
     if checkpoint == "reversible":  # looks at values
@@ -121,13 +151,7 @@ def _solve(
 ) -> Solution:
     """`solve`, as it is compiled."""
     f, step, save = field.function, stepper.function, saver.function
-    checks.function(
-        "f",
-        f.function if isinstance(f, OfArrays) else f,
-        "(t, y, args) -> dy/dt",
-        "args is there even if f does not need it",
-    )
-    checks.same_form("the vector field f", y0, jax.eval_shape(f, grid.t0, y0, args))
+    checks.vector_field(f, grid.t0, y0, args)
     if checkpoint == "reversible":
         return solve_reversibly(f, y0, args, grid, save, step, compensated)
     advance = advance_by(step, compensated=compensated)
@@ -179,8 +203,7 @@ class Grid:
                 f"save_every must divide num_steps, got save_every={save_every} and num_steps={num_steps}; "
                 f"take num_steps={math.ceil(num_steps / save_every) * save_every} or another save_every"
             )
-        checks.positive("dt", dt, "s")
-        checks.number("t0", t0)
+        check_time_step(dt, t0, dtype)
         segment = _segment_length(checkpoint, num_steps)
         dt, t0 = (jnp.asarray(x, dtype) if checks.is_traced(x) else np.asarray(x).astype(dtype) for x in (dt, t0))
         return cls(dt, num_steps, t0, save_every, segment)
@@ -188,6 +211,36 @@ class Grid:
     def clock(self, n: Array) -> Array:
         """t0 + n dt."""
         return self.t0 + n.astype(self.dt.dtype) * self.dt
+
+
+def check_time_step(dt: Any, t0: Any, dtype: Any) -> None:
+    """One ValueError if dt is 0, as it is or in the precision of the state; a warning where it does not move the clock.
+
+    A negative dt steps back in time.
+    """
+    checks.number("dt", dt)
+    checks.number("t0", t0)
+    if checks.is_traced(dt):
+        return
+    if not float(dt):
+        raise ValueError("dt must not be 0 s: the run would stand still; negative steps back in time")
+    largest, tiny = float(jnp.finfo(dtype).max), float(jnp.finfo(dtype).tiny)
+    if not tiny <= abs(float(dt)) <= largest:
+        raise ValueError(
+            f"dt must be from {tiny:.2g} to {largest:.2g} s in {jnp.dtype(dtype).name}, the precision of the state, "
+            f"got {float(dt):g}; take another unit of time, or a state in float64"
+        )
+    if checks.is_traced(t0):
+        return
+    if not abs(float(t0)) <= largest:
+        raise ValueError(f"t0 must be below {largest:.2g} s in {jnp.dtype(dtype).name}, got {float(t0):g}")
+    start = np.asarray(t0, dtype)
+    if start + np.asarray(dt, dtype) == start:
+        warnings.warn(
+            f"dt={float(dt):g} s does not move the clock from t0={float(t0):g} s in {start.dtype}, the precision of "
+            f"the state: what depends on t sees it stand still; count t from a nearer t0, or take a state in float64",
+            stacklevel=4,
+        )
 
 
 def scan_grid(
@@ -219,6 +272,7 @@ def scan_grid(
         carry = within(lambda carry: _scan(one_step, carry, grid.save_every, grid.segment)[0], carry)
         return carry, saved(carry)
 
+    saved_form(save, grid.t0, start[0])
     carry = (jnp.int32(0), jnp.int32(-1), start)
     blocks = None if grid.segment is None else max(1, grid.segment // grid.save_every)
     (_, first_nonfinite, _), rest = _scan(one_save, carry, grid.num_steps // grid.save_every, blocks)
@@ -263,7 +317,23 @@ def no_remainder(y: PyTree, compensated: bool) -> PyTree:
 def check_step(step: Any) -> None:
     """One ValueError if step is not a step, but a name or a factory of steps."""
     hint = "pass, say, jeuler.euler_step, or what jeuler.implicit_euler() makes"
+    checks.refuse_class("step must be a function (f, t, y, dt, args) -> y", step)
     checks.function("step", step, "(f, t, y, dt, args) -> y", hint)
+
+
+def check_save(save: Any) -> None:
+    """One ValueError if save is neither None nor a function of time and state."""
+    if save is not None:
+        checks.function("save", save, "(t, y) -> what is kept", "write save=lambda t, y: y.position, say")
+
+
+def saved_form(save: Callable | None, t: Array, y: PyTree) -> None:
+    """One ValueError if what save keeps of a state is not made of arrays."""
+    if save is None:
+        return
+    kept = checks.form_of("save", save, t, y)
+    if not jax.tree.leaves(kept):
+        raise ValueError("save must return arrays, what is kept of a saved state, got None; write return, or save=None")
 
 
 def advance_by(step: Any, *, compensated: bool) -> Callable:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 
 PyTree = Any
 VectorField = Callable[[Any, PyTree, Any], PyTree]  # f(t, y, args) -> dy
@@ -209,6 +210,7 @@ def rk4_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
     return runge_kutta_increment(RK4, f, t, y, dt, args)
 
 
+@says_what_to_write()
 def cap_cotangent(step: Step, max_norm: float) -> CappedStep:
     """Make a step whose state passes back a cotangent of bounded norm: for long chaotic horizons.
 
@@ -232,6 +234,8 @@ def cap_cotangent(step: Step, max_norm: float) -> CappedStep:
     Source: R. Pascanu, T. Mikolov, Y. Bengio, On the difficulty of training recurrent neural networks, ICML 2013,
       sect. 3.2.
     """
+    checks.refuse_class("step must be a function (f, t, y, dt, args) -> y", step)
+    checks.function("step", step, "(f, t, y, dt, args) -> y", "pass, say, jeuler.euler_step")
     checks.positive("max_norm", max_norm)
     return CappedStep(step, max_norm if checks.is_traced(max_norm) else float(max_norm))
 

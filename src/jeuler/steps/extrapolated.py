@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -122,6 +123,7 @@ def aitken_neville(rows: Array) -> tuple[Array, Array]:
     return column[-1], before[-1]
 
 
+@says_what_to_write()
 def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> ExtrapolatedStep:
     """Make a step of any order by extrapolating an Euler step to dt = 0.
 
@@ -152,6 +154,7 @@ def extrapolated_euler(order: int = 4, *, step: Step = euler_step) -> Extrapolat
         raise ValueError(
             f"order must be at most 12, got {order}; above, its weights amplify roundoff: take a smaller dt"
         )
+    checks.function("step", step, "(f, t, y, dt, args) -> y", "pass, say, jeuler.euler_step")
     step_order = getattr(step, "order", 1)
     if step_order != 1:
         name = getattr(step, "__name__", repr(step))

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._jax.jaxpr import is_variable
 from jeuler._jax.root import root
 from jeuler.steps._newton import StepInfo, linear_solver_for, newton_then_damped, solve_linear
@@ -24,6 +25,7 @@ from jeuler.steps.explicit import VectorField
 PyTree = Any
 
 
+@says_what_to_write()
 def implicit_euler(
     *,
     rtol: float | None = None,
@@ -65,6 +67,7 @@ def implicit_euler(
         if tolerance is not None:
             checks.positive(name, tolerance)
     max_steps, damped_steps = checks.count("max_steps", max_steps, least=1), checks.count("damped_steps", damped_steps)
+    check_linear_solver(linear_solver)
     return ImplicitEuler(rtol, atol, max_steps, damped_steps, linear_solver)
 
 
@@ -125,6 +128,7 @@ class ImplicitEuler:
         return system.state(z * scale * jnp.where(info.converged, 1, jnp.nan)), info
 
 
+@says_what_to_write()
 def linearly_implicit_euler(*, linear_solver: Any = None) -> LinearlyImplicitEuler:
     """Make a linearly implicit Euler step with this linear solver.
 
@@ -146,7 +150,15 @@ def linearly_implicit_euler(*, linear_solver: Any = None) -> LinearlyImplicitEul
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.9, eq. 9.25; D. Baraff,
       A. Witkin, Large Steps in Cloth Simulation, SIGGRAPH 1998, eq. 6.
     """
+    check_linear_solver(linear_solver)
     return LinearlyImplicitEuler(linear_solver)
+
+
+def check_linear_solver(solver: Any) -> None:
+    """One ValueError if this is no lineax solver."""
+    checks.refuse_class("linear_solver must be a lineax solver", solver)
+    if solver is not None and not (hasattr(solver, "init") and hasattr(solver, "compute")):
+        raise ValueError(f"linear_solver must be None or a lineax solver, got {solver!r}; write lineax.LU()")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import checks, trees
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.describe import table
 from jeuler._core.partition import arrays_only
 from jeuler._core.precision import cast, double_precision
@@ -64,6 +65,7 @@ class StabilityLimit(float):
         return table("StabilityLimit", [*rows, ("known within 2 %", repr(self.known))], note=self.reason)
 
 
+@says_what_to_write(dt="nothing: it finds dt")
 def stability_limit(
     f: VectorField | Any,
     t: Any,
@@ -127,8 +129,9 @@ def stability_limit(
     checks.untraced("stability_limit", t, y, args)
     checks.number("t", t)
     y = checks.state("y", y)
+    checks.field_form(f)
     f, args = arrays_only(f, args)
-    checks.same_form("the vector field f", y, jax.eval_shape(f, t, y, args))
+    checks.vector_field(f, t, y, args)
     with double_precision():
         linear = Linearisation(f, y, args)
         limit = linear.limit(t, linear.flat, step, growing=growing)
