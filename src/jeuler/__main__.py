@@ -62,6 +62,7 @@ def _add_reading(job: argparse.ArgumentParser) -> None:
     add = job.add_argument
     add("--columns", help="columns to use, by name: x1,y1,x2,y2 (default: by quantity, said in the result)")
     add("--observe", choices=OBSERVED, help="the quantity to use (default: position before angle before acceleration)")
+    add("--input", metavar="NAME", help="the column of a measured force; its gain is fitted")
     add("--dim", type=int, help="coordinates a particle, where the names do not tell")
     add("--time", metavar="NAME", help="the time column (default: the one that is named so)")
     add("--run", metavar="N", help="which run, or all in one fit (default: the one with the most rows)")
@@ -80,6 +81,7 @@ def _add_model(job: argparse.ArgumentParser) -> None:
     add("--start", help="where the search starts: ks=20,kd=0.3 (default: read off the data)")
     add("--friction", help="viscous, quadratic, dry, several joined by +, or compare (default viscous)")
     add("--drag", choices=["quadratic"], help="the same as --friction viscous+quadratic")
+    add("--cubic", action="store_true", help="add a cubic term to the spring: ks x + k3 x^3")
     add("--pendulum", action="store_true", help="a pendulum at any angle instead of a linear spring")
 
 

@@ -97,6 +97,32 @@ def test_an_unknown_mass_beside_a_known_one(folder):
     np.testing.assert_allclose([s["ks"] for s in told["springs"]], [10, 8, 6], rtol=0.02)  # anchors first
 
 
+def test_a_measured_force_on_a_hardening_spring(folder, capsys):
+    times = np.arange(900) / 100
+    sines = [(3.0, 0.2), (5.5, 1.1), (8.0, 2.9), (13.0, 0.7)]
+
+    def force(t):
+        return sum(np.sin(omega * t + phase) for omega, phase in sines)
+
+    run = solve_ivp(
+        lambda t, y: (y[1], (-20 * y[0] - 90 * y[0] ** 3 - 0.3 * y[1] + 0.7 * force(t)) / 0.25),
+        (0, 9),
+        (0.0, 0.0),
+        t_eval=times,
+        rtol=1e-9,
+        atol=1e-12,
+    )
+    write("forced.csv", "t (s),u (V),x (m)", times, force(times), run.y[0] + noise(times))
+    told = fitted("forced.csv", "--mass", 0.25, "--input", "u", "--cubic")
+    np.testing.assert_allclose(told["springs"][0]["ks"], 20, rtol=0.01)
+    np.testing.assert_allclose(told["springs"][0]["kd"], 0.3, rtol=0.01)
+    np.testing.assert_allclose(told["cubic"], 90, rtol=0.03)
+    np.testing.assert_allclose(told["gain"], 0.7, rtol=0.01)
+    assert "u is the measured force u(t)." in told["notes"]
+    assert main(["fit", "forced.csv", "--input", "v"]) == 2
+    assert "--input 'v' is no column" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("x", "words"),
     [

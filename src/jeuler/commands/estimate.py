@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core.component import replace
-from jeuler.commands.linear_start import equation_of_motion, network_start, state_start
+from jeuler.commands.linear_start import driven_start, equation_of_motion, network_start, state_start
 from jeuler.commands.model import Model, steps_to
 from jeuler.commands.selection import Measurement
 from jeuler.fitting import fit
@@ -109,7 +109,9 @@ def starting_values(
         ks, kd, mass = network_start(model, measured, guess)
         ks = np.maximum(ks, 1e-6 * ks.max())
     start: dict[str, Any] = {"ks": ks, "kd": kd}
-    if model.places:
+    if model.drive is not None:
+        start |= driven_start(model, measured, guess)
+    elif model.places:
         start |= _places(model, measured)
     else:
         start |= state_start(model, measured, ks, kd, np.maximum(mass, 1e-9))
@@ -124,10 +126,8 @@ def starting_values(
         start["dry"] = np.asarray(0.3 * kd.mean() * speed)
     if "viscous" not in model.friction:
         del start["kd"]
-    if model.cubic:
+    if model.cubic and "cubic" not in start:
         start["cubic"] = np.asarray(0.0)
-    if model.drive is not None:
-        start["gain"] = np.asarray(0.0)
     return start, model.pendulum or model.places or model.cubic or bool(asked) or (coupled and model.dim > 1)
 
 
@@ -220,7 +220,7 @@ def _scales(model: Model, measured: Measurement, guess: Oscillation, start: dict
         "quadratic": 0.1 * ks / omega / (amplitude * omega),
         "dry": 0.1 * ks * amplitude,
         "cubic": 0.3 * ks / amplitude**2,
-        "gain": ks,
+        "gain": max(ks * amplitude / (float(np.std(model.drive[0])) or 1.0), 1e-300) if model.drive else 1.0,
     }
 
 

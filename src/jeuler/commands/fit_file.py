@@ -17,6 +17,7 @@ from jeuler._core.files import check_output, write_atomically
 from jeuler.commands import options
 from jeuler.commands.cautions import cautions
 from jeuler.commands.estimate import Estimate, estimate, guess_of, step_size
+from jeuler.commands.linear_start import band_limited
 from jeuler.commands.model import Model
 from jeuler.commands.picture import draw
 from jeuler.commands.report import lines, report
@@ -88,6 +89,8 @@ def _model(arguments: argparse.Namespace, measured: Measurement, mass: np.ndarra
         raise ValueError(
             f"--pendulum fits one angle, got {particles} particles of {dim} coordinates; choose with --columns"
         )
+    if (arguments.cubic or measured.drive is not None) and (particles > 1 or dim > 1 or arguments.pendulum):
+        raise ValueError("--cubic and --input fit one particle along one coordinate on a spring; choose with --columns")
     speed = float(np.nanstd(measured.positions)) * guess.angular_frequency * np.sqrt(2)
     speed = {"acceleration": speed / guess.angular_frequency**2}.get(
         measured.quantity, speed / guess.angular_frequency if "velocity" in measured.quantity else speed
@@ -100,6 +103,8 @@ def _model(arguments: argparse.Namespace, measured: Measurement, mass: np.ndarra
         friction=friction,
         observe=measured.quantity,
         pendulum=arguments.pendulum,
+        cubic=arguments.cubic,
+        drive=None if measured.drive is None else band_limited(measured.times, measured.drive),
         shared=shared,
         spring_mass=shared and len(set(mass.tolist())) > 1,
         slow=0.02 * speed,

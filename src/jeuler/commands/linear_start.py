@@ -61,6 +61,42 @@ def network_start(model: Model, measured: Measurement, guess: Oscillation) -> tu
     return x[: len(springs)], x[len(springs) : 2 * len(springs)], mass
 
 
+def driven_start(model: Model, measured: Measurement, guess: Oscillation) -> dict[str, Any]:
+    """ks, kd, cubic and gain of one particle under a measured force, by the weak form; at rest at the beginning."""
+    half = max(np.pi / guess.angular_frequency, 4 * float(np.median(np.diff(measured.times))))
+    t, x, u = measured.times, measured.positions[:, 0, 0], np.asarray(measured.drive)
+    amplitude = np.nanmax(np.abs(x - np.nanmean(x)))
+    away = (x - np.nanmean(x)) / amplitude
+    columns = np.stack([away, away**3, u], axis=1)
+    centres = np.arange(t[0] + half, t[-1] - half, half / 3)
+    first, second, plain = _moments(t, columns, centres, half)
+    design = [-plain[:, 0], first[:, 0], plain[:, 2], np.full(len(centres), half)]
+    if model.cubic:
+        design.append(-plain[:, 1])
+    a, b = np.stack(design, axis=1), float(model.mass[0]) * second[:, 0]
+    keep = np.isfinite(a).all(axis=1) & np.isfinite(b)
+    scale = np.linalg.norm(a[keep], axis=0)
+    found = np.linalg.lstsq(a[keep] / scale, b[keep], rcond=None)[0] / scale
+    start = {
+        "ks": found[:1],
+        "kd": np.maximum(found[1:2], 0.0),
+        "gain": np.asarray(found[2] * amplitude),
+        "position": np.array([[x[np.isfinite(x)][0] - np.nanmean(x)]]),
+        "velocity": np.zeros((1, 1)),
+        "offset": np.array([[np.nanmean(x)]]),
+    }
+    return start | ({"cubic": np.asarray(found[4] / amplitude**2)} if model.cubic else {})
+
+
+def band_limited(times: np.ndarray, samples: np.ndarray, finer: int = 8) -> tuple[np.ndarray, float, float]:
+    """A measured force on a clock ``finer`` times as fine, by a low-pass filter at the Nyquist frequency."""
+    from scipy.signal import resample_poly
+
+    step = float(np.ptp(times)) / (len(times) - 1)
+    fine = resample_poly(samples, finer, 1, window=("kaiser", 8.0), padtype="line")
+    return fine, float(times[0]), step / finer
+
+
 def _moments(
     t: np.ndarray, x: np.ndarray, centres: np.ndarray, half: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

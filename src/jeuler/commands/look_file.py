@@ -101,6 +101,7 @@ def suggested(arguments: argparse.Namespace, measured: Measurement, recordings: 
     for option, name in (
         ("--columns", "columns"),
         ("--observe", "observe"),
+        ("--input", "input"),
         ("--dim", "dim"),
         ("--time", "time"),
         ("--run", "run"),

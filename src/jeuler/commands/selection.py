@@ -35,6 +35,7 @@ class Measurement:
       names: (particle * dim,).  quantity, unit: of the values.  left_out: (name, reason) of the other columns.
       notes: what was done, as sentences.  warnings: what may be wrong, as sentences with what to do.
       sampling: the clock before thinning.  recordings: how many of them are fitted together, one a particle.
+      drive: a measured force at the times, (time,), with --input.
     """
 
     source: str
@@ -50,6 +51,7 @@ class Measurement:
     warnings: tuple[str, ...] = ()
     sampling: Sampling | None = None
     recordings: int = 1
+    drive: np.ndarray | None = None
 
 
 def recordings_in(source: Any, arguments: Any) -> list[Recording]:
@@ -124,7 +126,12 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
             f"Correct it with --observe or --unit."
         )
     unit = columns[0].unit if unknown else UNITS[quantity]
+    drive = None
+    if arguments.input is not None:
+        drive = recording.values[:, recording.columns.index(input_column(recording, arguments))][keep]
+        _check_drive(recording.source, arguments.input, times[keep], drive)
     measured = Measurement(
+        drive=drive,
         source=recording.source,
         run=recording.run,
         clock=recording.clock.name,
@@ -138,14 +145,15 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
         warnings=(*recording.warnings, *warnings),
     )
     clock = sampling(measured.times)
+    driven = (f"{arguments.input} is the measured force u(t).",) if drive is not None else ()
     gaps = (f"The record has {clock.gaps} gaps, the longest of {clock.longest_gap:.3g} s.",) if clock.gaps else ()
-    return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *gaps)))
+    return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *driven, *gaps)))
 
 
 def thinned(measured: Measurement) -> Measurement:
     """Blocks of rows averaged to one, where there are far more than the motion needs."""
     rows = len(measured.times)
-    if rows <= THIN_ABOVE:
+    if rows <= THIN_ABOVE or measured.drive is not None:
         return measured
     flat = measured.positions.reshape(rows, -1)
     try:
@@ -199,18 +207,38 @@ def together(measured: list[Measurement]) -> Measurement:
     )
 
 
+def input_column(recording: Recording, arguments: Any) -> Column:
+    """The column of the measured force."""
+    name = resolve(arguments.input, [c.name for c in recording.columns])
+    if name is None:
+        names = listed([c.name for c in recording.columns])
+        raise ValueError(f"{recording.source}: --input {arguments.input!r} is no column, the columns are {names}")
+    return next(c for c in recording.columns if c.name == name)
+
+
+def _check_drive(source: str, name: str, times: np.ndarray, drive: np.ndarray) -> None:
+    if not np.isfinite(drive).all():
+        raise ValueError(f"{source}: --input {name}: {np.isnan(drive).sum()} values are missing; a force must be whole")
+    clock = sampling(times)
+    if clock.gaps or clock.repeated or clock.jitter > 0.02:
+        raise ValueError(f"{source}: --input {name}: its clock must be even to be interpolated: {clock.words()}")
+
+
 def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], str, int, list[tuple[str, str]]]:
     """The columns that are fitted, what they are, coordinates a particle, and the columns left out with the reason."""
-    usable = [c for c in recording.columns if c.quantity != "text"]
+    drive = None if arguments.input is None else input_column(recording, arguments)
+    usable = [c for c in recording.columns if c.quantity != "text" and c != drive]
     if arguments.columns is not None:
         columns = _named_columns(recording, arguments.columns)
         quantity = arguments.observe or columns[0].quantity
-        others = [(c.name, "not among --columns") for c in recording.columns if c not in columns]
+        others = [(c.name, "not among --columns") for c in recording.columns if c not in columns and c != drive]
     else:
         usable = [c for c in usable if np.isfinite(recording.values[:, recording.columns.index(c)]).any()]
         quantity = _quantity(recording, usable, arguments.observe)
         columns = [c for c in usable if c.quantity == quantity]
-        others = [(c.name, _reason(c, quantity, c in usable)) for c in recording.columns if c not in columns]
+        others = [
+            (c.name, _reason(c, quantity, c in usable)) for c in recording.columns if c not in columns and c != drive
+        ]
     quantity = quantity if quantity in OBSERVED else "position"
     if arguments.columns is None and arguments.dim is None:
         columns, more = _one_channel(recording, columns)
