@@ -15,11 +15,14 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import Function, component
 from jeuler._core.partition import arrays_only
 from jeuler._jax import programs
+from jeuler.solving._breaks import between, checked_breaks
 from jeuler.solving._tables import adaptive_table
+from jeuler.steps.embedded import tsit5
 from jeuler.steps.explicit import VectorField
-from jeuler.steps.extrapolated import ExtrapolatedStep, extrapolated_euler
+from jeuler.steps.extrapolated import ExtrapolatedStep
 
 PyTree = Any
+STRICT = 0.1  # the part of the error otherwise allowed that is allowed to a step after a rejected one
 
 
 @component()
@@ -38,7 +41,7 @@ class AdaptiveSolution:
       >>> import jeuler
       >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=1.0, max_steps=2, dt0=0.1)
       >>> run.t.tolist(), run.y.tolist(), int(run.num_steps), bool(run.finished)
-      ([0.0, 1.0], [1.0, nan], 2, False)
+      ([0.0, 1.0], [1.0, nan], 1, False)
     """
 
     t: Array
@@ -63,12 +66,16 @@ def solve_adaptive(
     rtol: float = 1e-6,
     atol: float = 1e-9,
     dt0: Any = None,
-    max_steps: int = 4096,
+    max_steps: int = 16_384,
+    breaks: Any = (),
 ) -> AdaptiveSolution:
     """Advance y' = f(t, y, args) to given times, each step sized so that its estimated error is within tolerance.
 
-        e = rms(error / (atol + rtol max(|y|, |y_next|)));   accept if e <= 1
-        dt <- dt min(5, max(0.2, 0.9 e^(-1/k))),   k the order of the step
+        e = rms(error / (atol + rtol max(|y|, |y_next|)));   accept if e <= c
+        dt <- dt min(5, max(0.2, 0.9 (e / c)^(-1/k))),   k the order of the step
+
+    c is 0.1 for the method of Tsitouras, as errors of the steps add up, and 1 for the others; a tenth of that for the
+    step after a rejected one: f may jump there. Every step sees f at its end too, so that no jump is passed over.
 
     A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
     block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
@@ -79,11 +86,14 @@ def solve_adaptive(
       t1: the final time, or increasing times (time,) to stop at, all > t0, s.
       t0: initial time, s.
       args: passed to f. Differentiable.
-      step: an `extrapolated_euler` step of order 2 or more; None takes order 6.
+      step: an `extrapolated_euler` step of order 2 or more; None takes the method of Tsitouras of order 5, with the
+        coefficients of ``diffrax.Tsit5``.
       rtol: error allowed in a step, relative to the state.
       atol: error allowed in a step, in units of the state.
       dt0: first step to try, s; None guesses from the size of y0 and its slope.
       max_steps: most steps between two of the times.
+      breaks: times at which f may jump, (break,), s: a step ends there, f is evaluated just before the end of it and
+        just after the start of the next. Differentiable.
     Returns: `AdaptiveSolution`.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -94,8 +104,8 @@ def solve_adaptive(
 
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and II.9.
     """
-    step = extrapolated_euler(6) if step is None else step
-    if not hasattr(step, "increment_with_error") or step.order < 2:
+    chosen: Any = tsit5() if step is None else step
+    if not hasattr(chosen, "increment_with_error") or chosen.order < 2:
         raise ValueError(f"step must be an extrapolated_euler step of order 2 or more, got {step!r}")
     y0 = checks.state("y0", y0)
     checks.number("t0", t0)
@@ -111,7 +121,7 @@ def solve_adaptive(
     if dt0 is not None:
         checks.positive("dt0", dt0, "s")
     f, args = arrays_only(f, args)
-    inputs = Function(f), y0, args, times, t0, dt0, rtol, atol, Function(step)
+    inputs = Function(f), y0, args, times, t0, dt0, rtol, atol, checked_breaks(breaks, times.dtype), Function(chosen)
     return programs.call(_solve_adaptive, inputs, (max_steps,))
 
 
@@ -124,6 +134,7 @@ def _solve_adaptive(
     dt0: Any,
     rtol: Any,
     atol: Any,
+    breaks: Array,
     stepper: Function,
     max_steps: int,
 ) -> AdaptiveSolution:
@@ -133,15 +144,22 @@ def _solve_adaptive(
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
 
-    def try_step(end, carry):
-        t, y, dt, error_sum, accepted, rejected, tried = carry
+    stops = jnp.concatenate([times, jnp.clip(breaks, t0, times[-1])])
+    order = jnp.argsort(stops)
+    asked = jnp.argsort(order)[: times.size]  # where the times are among the stops
+    stops = stops[order]
+
+    def try_step(f, end, carry):
+        t, y, dt, error_sum, accepted, rejected, failed, tried = carry
         last = t + dt * (1 + 1e-3) >= end
         h = jnp.where(last, end - t, dt)
         increment, error = step.increment_with_error(f, t, y, h, args)
         y_next = trees.add(y, increment)
         ratio = lax.stop_gradient(error_ratio(error, y, y_next, rtol, atol))
-        good = ratio <= 1
-        factor = jnp.where(jnp.isfinite(ratio), 0.9 * jnp.maximum(ratio, 1e-12) ** (-1 / step.order), 0.2)
+        ratio = ratio / getattr(step, "allowed", 1.0)
+        good = ratio <= jnp.where(failed, STRICT, 1)
+        aimed = jnp.maximum(ratio, 1e-12) / jnp.where(good, 1, STRICT)
+        factor = jnp.where(jnp.isfinite(ratio), 0.9 * aimed ** (-1 / step.order), 0.2)
         wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
         shortened = good & last  # to stop at a time: no reason for a smaller dt
         dt = jnp.where(shortened, jnp.maximum(wanted, dt), wanted)
@@ -154,21 +172,24 @@ def _solve_adaptive(
             take(trees.add(error_sum, error), error_sum),
             accepted + good,
             rejected + ~good,
+            ~good,
             tried + 1,
         )
 
-    def to_time(carry, end):
-        carry = (*carry, jnp.int32(0))
+    def to_time(carry, ends):
+        begin, end = ends
+        here = between(f, breaks, begin, end) if breaks.size else f
+        carry = (*carry, jnp.asarray(False), jnp.int32(0))
         going = lambda c: (c[0] < end) & (c[-1] < max_steps)  # noqa: E731
-        *carry, _ = bounded_while(going, lambda c: try_step(end, c), carry, max_steps)
+        *carry, _, _ = bounded_while(going, lambda c: try_step(here, end, c), carry, max_steps)
         reached = carry[0] >= end
         kept = jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), carry[1])
         return tuple(carry), (kept, reached)
 
     none = jnp.int32(0)
     start = t0, y0, jnp.asarray(dt0, times.dtype), jax.tree.map(jnp.zeros_like, y0), none, none
-    (_, _, _, error, accepted, rejected), (y, reached) = lax.scan(to_time, start, times)
-    y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, y)
+    (_, _, _, error, accepted, rejected), (y, reached) = lax.scan(to_time, start, (jnp.append(t0, stops[:-1]), stops))
+    y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[asked]]), y0, y)
     return AdaptiveSolution(jnp.append(t0, times), y, accepted, rejected, error, reached[-1])
 
 

@@ -19,6 +19,7 @@ from jeuler._core.component import Function, component
 from jeuler._core.partition import arrays_only
 from jeuler._jax import programs
 from jeuler._jax.members import recomputed
+from jeuler.solving._breaks import checked_breaks, split_at
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
 from jeuler.solving._tables import solution_table
@@ -88,6 +89,7 @@ def solve(
     save: Callable[[Array, PyTree], PyTree] | None = None,
     checkpoint: Checkpoint = None,
     compensated: bool = False,
+    breaks: Any = (),
 ) -> Solution:
     """Advance y' = f(t, y, args) by num_steps steps of size dt, in one ``lax.scan``.
 
@@ -115,6 +117,8 @@ def solve(
         not be undone (a damper) makes the gradient NaN.
       compensated: accumulate y by compensated (Kahan-Neumaier) sums: the roundoff of a long run stays near one unit
         in the last place instead of growing with the number of steps. Explicit steps only.
+      breaks: times at which f may jump, (break,), s: the step that a break falls into ends there and goes on from it,
+        and f is evaluated just before and just after. Differentiable.
     Returns: `Solution`, saved states with leading axis num_steps // save_every + 1, initial value first.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -133,7 +137,11 @@ def solve(
     check_save(save)
     checks.true_or_false("compensated", compensated)
     f, args = arrays_only(f, args)
-    inputs, settings = (Function(f), y0, args, grid, Function(step), Function(save)), (checkpoint, compensated)
+    breaks = checked_breaks(breaks, grid.dt.dtype)
+    if breaks.size and checkpoint == "reversible":
+        raise ValueError('breaks must be () with checkpoint="reversible", got some; take checkpoint="sqrt"')
+    inputs = Function(f), y0, args, grid, breaks, Function(step), Function(save)
+    settings = checkpoint, compensated
     if checkpoint == "reversible":  # looks at values
         return _solve(*inputs, *settings)
     return programs.call(_solve, inputs, settings)
@@ -144,6 +152,7 @@ def _solve(
     y0: PyTree,
     args: PyTree,
     grid: Grid,
+    breaks: Array,
     stepper: Function,
     saver: Function,
     checkpoint: Any,
@@ -155,6 +164,8 @@ def _solve(
     if checkpoint == "reversible":
         return solve_reversibly(f, y0, args, grid, save, step, compensated)
     advance = advance_by(step, compensated=compensated)
+    if breaks.size:
+        advance = split_at(advance, breaks)
 
     def next_state(n, t, y_and_remainder):
         return advance(f, t, y_and_remainder, grid.dt, args)

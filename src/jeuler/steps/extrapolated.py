@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -45,17 +46,40 @@ class ExtrapolatedStep:
         return self.increment_with_error(f, t, y, dt, args)[0]
 
     def increment_with_error(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
-        """The increment, and the estimated error of the one of order k - 1, T_kk - T_{k,k-1}."""
-        rows = self.rows(f, t, y, dt, args)
+        """The increment, and its estimated error: T_kk - T_{k,k-1}, or the `jump` of an explicit base if larger."""
+        rows, chain = self.rows(f, t, y, dt, args)
         if self.order == 1:
             best = jax.tree.map(lambda row: row[0], rows)
             return best, jax.tree.map(jnp.zeros_like, best)
         pairs = jax.tree.map(aitken_neville, rows)
         best, before = jax.tree.transpose(jax.tree.structure(y), jax.tree.structure((0, 0)), pairs)
-        return best, trees.subtract(best, before)
+        error = trees.subtract(best, before)
+        if not hasattr(self.base, "increment"):  # an implicit step sees f at its end
+            return best, error
+        jump = self.jump(f, t, y, dt, args, chain)
+        return best, jax.tree.map(lambda a, b: jnp.where(jnp.abs(a) >= jnp.abs(b), a, b), error, jump)
 
-    def rows(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
-        """Increments over dt of the base step in 1, 2, ..., k substeps, with leading axis row.
+    def jump(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, chain: PyTree) -> PyTree:
+        """The k-th difference of the substeps of row k, taken one substep beyond its end: what f does there.
+
+        sum_i (-1)^(k - i) binomial(k, i) d_i,  d_i = increment of substep i = 0, ..., k:  O(dt^(k + 1)) where f is
+        smooth, and dt / k times the jump where f jumps after the last substep began, which no row sees.
+        chain: the increments of row k after 1, ..., k substeps, with leading axis substep.
+        """
+        k = self.order
+        at = jax.tree.map(lambda a, c: a + c[-1], y, chain)
+        beyond = self.base.increment(f, t + dt, at, dt / k, args)  # type: ignore[attr-defined]
+        weights = [(-1.0) ** (k - i) * math.comb(k, i) for i in range(k + 1)]
+
+        def difference(chain, beyond):
+            steps = jnp.diff(chain, axis=0, prepend=jnp.zeros_like(chain[:1]))
+            inner = jnp.tensordot(jnp.asarray(weights[:-1], trees.real_dtype(steps.dtype)), steps, axes=1)
+            return inner + beyond
+
+        return jax.tree.map(difference, chain, beyond)
+
+    def rows(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
+        """Increments over dt of the base step in 1, 2, ..., k substeps, with leading axis row; and row k on its way.
 
         One vmapped batch of lanes, k substeps deep. Row k has a lane to itself, rows j and k - j share one.
         """
@@ -76,7 +100,7 @@ class ExtrapolatedStep:
         tables = jnp.asarray(lanes.fresh), jnp.asarray(lanes.start, time), jnp.asarray(lanes.length, time)
         still = jax.tree.map(lambda leaf: jnp.zeros((lanes.fresh.shape[1], *leaf.shape), leaf.dtype), y)
         _, history = lax.scan(substep, still, tables)
-        return jax.tree.map(lambda h: h[lanes.end, lanes.lane], history)
+        return jax.tree.map(lambda h: h[lanes.end, lanes.lane], history), jax.tree.map(lambda h: h[:, 0], history)
 
     def _difference(self, f, t, y, dt, args):
         return trees.subtract(self.base(f, t, y, dt, args), y)

@@ -1,0 +1,71 @@
+"""Times at which the vector field may jump: a step ends there, and f is evaluated on the side that the step is on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from jeuler._core import checks
+from jeuler.steps.explicit import VectorField
+
+PyTree = Any
+SIDE = 8  # units in the last place that "just before" and "just after" a break are away from it
+
+
+def checked_breaks(breaks: Any, dtype: Any) -> Array:
+    """The breaks as one sorted array, or one ValueError."""
+    try:
+        array = jnp.atleast_1d(jnp.asarray(breaks, dtype))
+    except (TypeError, ValueError):
+        raise ValueError(f"breaks must be times, s, got {breaks!r}") from None
+    if array.ndim > 1:
+        raise ValueError(f"breaks must be times of shape (break,), s, got shape {array.shape}")
+    if not checks.is_traced(array) and not np.all(np.isfinite(array)):
+        raise ValueError(f"breaks must be finite times, s, got {breaks!r}")
+    return jnp.sort(array)
+
+
+def margin(breaks: Array) -> Array:
+    """How far "just before" is, for each of the breaks, s."""
+    eps = jnp.finfo(breaks.dtype).eps
+    return lax.stop_gradient(SIDE * eps * jnp.maximum(jnp.abs(breaks), jnp.max(jnp.abs(breaks), initial=0) / 8))
+
+
+def between(f: VectorField, breaks: Array, start: Array, end: Array) -> VectorField:
+    """f on the steps from start to end: evaluated just after start and just before end where these are breaks."""
+    gap = margin(breaks)
+    after = jnp.max(jnp.where(jnp.abs(breaks - start) <= gap, breaks + gap, -jnp.inf))
+    before = jnp.min(jnp.where(jnp.abs(breaks - end) <= gap, breaks - gap, jnp.inf))
+
+    def inside(t, y, args):
+        return f(jnp.minimum(jnp.maximum(t, after), before), y, args)
+
+    return inside
+
+
+def split_at(advance: Callable, breaks: Array) -> Callable:
+    """``advance(f, t, state, dt, args)`` that ends a step at each break within it and goes on from there."""
+
+    def split(f, t, state, dt, args):
+        end, gap = t + dt, margin(breaks)
+        near = jnp.any((breaks >= t - gap) & (breaks <= end + gap))
+
+        def piece(carry, stop):
+            begin, state = carry
+            h = stop - begin
+            some = h > 0
+            moved = advance(between(f, breaks, begin, stop), begin, state, jnp.where(some, h, dt), args)
+            return (stop, jax.tree.map(lambda a, b: jnp.where(some, a, b), moved, state)), None
+
+        def in_pieces(state):
+            stops = jnp.append(jnp.clip(breaks, t, end), end)
+            return lax.scan(piece, (t, state), stops)[0][1]
+
+        return lax.cond(near, in_pieces, lambda state: advance(f, t, state, dt, args), state)
+
+    return split

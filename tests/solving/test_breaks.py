@@ -1,0 +1,111 @@
+"""Fields that jump: what adaptive steps see of them, and times of jumps that are told."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+
+RATE = 0.7
+
+
+def switched(t, y, time):
+    return -jnp.where(t <= time, RATE, 0.0) * y
+
+
+@pytest.mark.parametrize("step", [None, jeuler.extrapolated_euler(6), jeuler.extrapolated_euler(3)])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+def test_no_switch_is_passed_over(step, rtol):
+    run = jax.jit(
+        jax.vmap(lambda time: jeuler.solve_adaptive(
+            switched, 1.0, t1=2.0, args=time, rtol=rtol, atol=1e-3 * rtol, step=step
+        ))
+    )  # fmt: skip
+    times = np.linspace(0.3, 1.7, 57)
+    got, right = run(times), np.exp(-RATE * times)
+    assert np.all(got.finished)
+    assert np.max(np.abs(got.y[:, -1] / right - 1)) < 100 * rtol
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+def test_a_square_wave_drives_an_oscillator(rtol):
+    def field(t, y, args):
+        return y[1], jnp.where(jnp.floor(t) % 2 == 0, 1.0, -1.0) - 4.0 * y[0]
+
+    x, v = 0.0, 0.0  # exact, a second at a time: x - u / 4 turns with omega = 2
+    for second in range(10):
+        middle = (1.0 if second % 2 == 0 else -1.0) / 4
+        x, v = middle + (x - middle) * np.cos(2) + v / 2 * np.sin(2), -2 * (x - middle) * np.sin(2) + v * np.cos(2)
+    run = jeuler.solve_adaptive(field, (0.0, 0.0), t1=10.0, rtol=rtol, atol=1e-3 * rtol)
+    theirs = diffrax.diffeqsolve(
+        diffrax.ODETerm(field), diffrax.Tsit5(), 0.0, 10.0, None, (jnp.asarray(0.0), jnp.asarray(0.0)),
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol), max_steps=100_000,
+    ).ys  # fmt: skip
+    error, other = (np.hypot(y[0][-1] - x, y[1][-1] - v) / np.hypot(x, v) for y in (run.y, theirs))
+    assert error < 100 * rtol
+    assert error < max(10 * other, rtol)
+
+
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.heun_step, jeuler.rk4_step, jeuler.implicit_euler_step])
+@pytest.mark.parametrize("time", [0.0, 0.31, 0.5, 2.0, 5.0])
+def test_a_break_gives_fixed_steps_their_order_back(step, time):
+    """On the grid, off it, at both ends and beyond; f is not evaluated on the wrong side of it."""
+
+    def error(num_steps):
+        run = jeuler.solve(
+            lambda t, y, args: -jnp.where(t < time, 2.0, RATE) * y, 1.0, dt=2.0 / num_steps, num_steps=num_steps,
+            step=step, breaks=[time], save_every=num_steps,
+        )  # fmt: skip
+        before = min(time, 2.0)
+        return abs(float(run.y[-1]) / np.exp(-2.0 * before - RATE * (2.0 - before)) - 1)
+
+    order = getattr(step, "order", 1)
+    assert np.log2(error(40) / error(160)) / 2 == pytest.approx(order, abs=0.25)
+
+
+def test_breaks_stop_adaptive_steps_without_a_rejection():
+    run = jeuler.solve_adaptive(switched, 1.0, t1=[0.5, 1.0, 2.0], args=0.8, rtol=1e-8, breaks=[0.8, 7.0])
+    np.testing.assert_allclose(run.y, np.exp(-RATE * np.minimum([0, 0.5, 1.0, 2.0], 0.8)), rtol=1e-7)
+    assert int(run.num_rejected) == 0
+    assert run.t.tolist() == [0.0, 0.5, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_the_derivative_with_respect_to_a_break_is_that_of_the_solution(derivative):
+    right = -RATE * np.exp(-RATE * 0.8)
+
+    def adaptive(time):
+        return jeuler.solve_adaptive(switched, 1.0, t1=2.0, args=time, rtol=1e-10, atol=1e-12, breaks=[time]).y[-1]
+
+    def fixed(time):
+        return jeuler.solve(
+            switched, 1.0, dt=0.03, num_steps=66, args=time, step=jeuler.rk4_step, breaks=jnp.array([time])
+        ).y[-1]
+
+    assert derivative(adaptive)(0.8) == pytest.approx(right, rel=1e-7)
+    assert derivative(fixed)(0.8) == pytest.approx(right, rel=1e-6)
+    assert derivative(jax.jit(fixed))(0.8) == pytest.approx(right, rel=1e-6)
+
+
+def test_several_breaks_in_one_step_and_in_float32():
+    times = [0.11, 0.12, 0.14]
+    field = lambda t, y, args: jnp.where((t > 0.11) & (t < 0.12) | (t > 0.14), 1.0, 0.0) * jnp.ones_like(y)  # noqa: E731
+    for dtype, near in ((jnp.float32, 1e-6), (jnp.float64, 1e-13)):
+        run = jeuler.solve(field, jnp.zeros((), dtype), dt=0.1, num_steps=10, breaks=times)
+        assert run.y.dtype == dtype
+        assert float(run.y[-1]) == pytest.approx(0.01 + 0.86, rel=near * 10)
+
+
+@pytest.mark.parametrize(
+    ("breaks", "message"),
+    [([[0.1]], "shape"), ([np.nan], "finite"), ("soon", "must be times"), (["a"], "must be times")],
+)
+def test_bad_breaks_are_told(breaks, message):
+    for run in (
+        lambda: jeuler.solve(switched, 1.0, dt=0.1, num_steps=3, args=1.0, breaks=breaks),
+        lambda: jeuler.solve_adaptive(switched, 1.0, t1=1.0, args=1.0, breaks=breaks),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run()
