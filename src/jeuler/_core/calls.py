@@ -10,7 +10,7 @@ from jeuler._core import checks
 from jeuler._core.component import unwrapped
 
 
-def previous_is_optional(method: Callable) -> Callable:
+def previous_is_optional(method: Callable[..., Any]) -> Callable[..., Any]:
     """An effect's ``__call__(self, t, dt, previous, state, key)``, also to be called by hand as (t, dt, state, key).
 
     ``previous`` is None then.
@@ -25,7 +25,7 @@ def previous_is_optional(method: Callable) -> Callable:
     return call
 
 
-def with_previous(effect: Callable, name: str) -> Callable:
+def with_previous(effect: Callable[..., Any], name: str) -> Callable[..., Any]:
     """An effect as it is called in a step, ``(t, dt, previous, state, key)``; one of four arguments gets no previous.
 
     ValueError where it takes neither.

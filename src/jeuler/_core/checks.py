@@ -274,7 +274,7 @@ def random_key(key: Any) -> None:
         raise ValueError(f"key must be one jax.random.key, got keys of shape {key.shape}; for a batch use jax.vmap")
 
 
-def path_name(path: tuple) -> str:
+def path_name(path: tuple[Any, ...]) -> str:
     """A leaf's place in a pytree, to be read by a person."""
     return jax.tree_util.keystr(path) or "y"
 

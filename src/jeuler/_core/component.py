@@ -143,7 +143,7 @@ class Partitioned:
     It has the attributes of what it was made of.
     """
 
-    arrays: list
+    arrays: list[Any]
     rest: Rest
 
     def whole(self) -> Any:

@@ -34,15 +34,15 @@ class Rest:
     """A pytree without its arrays: the structure, and the other leaves in their places. Hashable."""
 
     structure: Any
-    others: tuple
+    others: tuple[Any, ...]
 
-    def join(self, arrays: list | tuple) -> PyTree:
+    def join(self, arrays: list[Any] | tuple[Any, ...]) -> PyTree:
         """The pytree with these arrays in it."""
         given = iter(arrays)
         leaves = [next(given) if other is ARRAY_HERE else _value(other) for other in self.others]
         return jax.tree.unflatten(self.structure, leaves)
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple[Any, ...]:
         """To be pickled as the tree itself: JAX cannot pickle the structure of classes that are not its own."""
         marked = jax.tree.unflatten(self.structure, [_value(other) for other in self.others])
         return _rest_of_marked, (marked,)
@@ -97,7 +97,7 @@ def _rest_of_marked(tree: PyTree) -> Rest:
     return partition(tree, lambda leaf: leaf is ARRAY_HERE)[1]
 
 
-def partition(tree: PyTree, is_dynamic: Callable[[Any], bool] = is_array) -> tuple[list, Rest]:
+def partition(tree: PyTree, is_dynamic: Callable[[Any], bool] = is_array) -> tuple[list[Any], Rest]:
     """The leaves of a pytree that are arrays, in order, and the rest, which puts such arrays back."""
     leaves, structure = jax.tree.flatten(tree)
     dynamic = [is_dynamic(x) for x in leaves]
@@ -114,8 +114,8 @@ def _hashable(x: Any) -> Any:
 
 
 def arrays_only(
-    function: Callable, tree: PyTree, is_dynamic: Callable[[Any], bool] = is_array
-) -> tuple[Callable, PyTree]:
+    function: Callable[..., Any], tree: PyTree, is_dynamic: Callable[[Any], bool] = is_array
+) -> tuple[Callable[..., Any], PyTree]:
     """A function whose last argument is this pytree, and the pytree, so that all leaves of it are arrays.
 
     Where they are so already, both come back as they are.
@@ -130,7 +130,7 @@ def arrays_only(
 class OfArrays:
     """A function of (..., pytree) as one of (..., the arrays in that pytree)."""
 
-    function: Callable
+    function: Callable[..., Any]
     rest: Rest
 
     def __call__(self, *arguments: Any) -> Any:

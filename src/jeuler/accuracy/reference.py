@@ -99,7 +99,7 @@ class ReferenceGradient:
 
 
 def make_reference_gradient(
-    scalar: Callable, reference: Any, f: VectorField, y0: PyTree, args: PyTree, t0: float, t1: float
+    scalar: Callable[..., Any], reference: Any, f: VectorField, y0: PyTree, args: PyTree, t0: float, t1: float
 ) -> ReferenceGradient:
     """By reverse mode through the accurate solver at two tolerances."""
     import diffrax

@@ -197,7 +197,7 @@ def evaluations(
     the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not counted.
     """
 
-    def counter(make_run: Callable) -> Callable:
+    def counter(make_run: Callable[..., Any]) -> Callable[..., Any]:
         counted, read = counting(f)
         program = jax.jit(lambda x: make_run(x)(counted, y0, args)[2])
 

@@ -135,7 +135,7 @@ class WorkPrecision:
         ]
         head = ["method", "dt, s", "steps", "evaluations"] + [f"{c}, {d}" for d in dtypes for c in columns]
         lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-        grid: dict[tuple, dict[str, dict[str, Any]]] = {}
+        grid: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
         for row in self.rows:
             fixed = math.isfinite(row["dt"])
             key = row["method"], f"{row['dt']:.3g}" if fixed else f"tolerance {row['tolerance']:.0e}"

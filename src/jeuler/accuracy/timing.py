@@ -37,7 +37,7 @@ class Measurement:
 
 
 def measure(
-    function: Callable, *inputs: Any, repeats: int = 5, budget: float = 1.0, patience: float = float("inf")
+    function: Callable[..., Any], *inputs: Any, repeats: int = 5, budget: float = 1.0, patience: float = float("inf")
 ) -> Measurement:
     """Compile function for these inputs, run it once unmeasured, then ``repeats`` times measured.
 

@@ -45,7 +45,7 @@ class PenaltyContact:
     kd: Parameter = default(0.0)
     radius: Parameter = default(0.0)
 
-    limits: ClassVar = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "radius": (">= 0", "m")}
+    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "radius": (">= 0", "m")}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "collider", as_collider("PenaltyContact.collider", self.collider))

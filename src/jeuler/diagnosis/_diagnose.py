@@ -176,7 +176,7 @@ def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None
     return None
 
 
-def lost_gradient(run: Rerun, num_steps: int, loss: Callable) -> Diagnosis | None:
+def lost_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Diagnosis | None:
     """Follow the cotangent of the loss back, step by step, to the first that is not finite."""
     states = run.solution(num_steps, save_every=1).y
 

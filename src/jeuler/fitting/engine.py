@@ -102,7 +102,7 @@ class Problem:
     @classmethod
     def of(
         cls,
-        residual: Callable,
+        residual: Callable[..., Any],
         params: PyTree,
         *,
         data: PyTree = None,

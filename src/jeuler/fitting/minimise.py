@@ -115,7 +115,7 @@ def _spread_of(residual: np.ndarray, weights: np.ndarray) -> float:
 
 
 def many_starts(
-    both: Callable, loss: Loss, xs: np.ndarray, task: Task, *, max_iterations: int, watch: Watch, at_once: int
+    both: Callable[..., Any], loss: Loss, xs: np.ndarray, task: Task, *, max_iterations: int, watch: Watch, at_once: int
 ) -> list[State]:
     """A search from each of the starts; their residuals and Jacobians are evaluated ``at_once`` by one program."""
     batched = jax.jit(jax.vmap(both, in_axes=(0, None)))

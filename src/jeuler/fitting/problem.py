@@ -24,7 +24,7 @@ PyTree = Any
 class FlatResidual:
     """``residual(params)``, or ``residual(params, data)``, from vector to vector. Equal ones share their programs."""
 
-    residual: Callable
+    residual: Callable[..., Any]
     layout: Layout
     with_data: bool
 
@@ -46,7 +46,7 @@ def programs(residual: FlatResidual) -> Evaluate:
     return kept_programs(residual) if residual.with_data else evaluations(residual, compiled=True)
 
 
-def residual_layout(residual: Callable, params: PyTree, data: Any, with_data: bool) -> tuple[Layout, bool]:
+def residual_layout(residual: Callable[..., Any], params: PyTree, data: Any, with_data: bool) -> tuple[Layout, bool]:
     """The form of what the residual returns, and whether it closes over something traced; or one ValueError."""
     checks.function(
         "residual",

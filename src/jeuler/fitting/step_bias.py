@@ -24,7 +24,7 @@ TENTH = 0.1  # of a standard error: the least that is worth a word
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(prediction: Prediction) -> Callable:
+def _compiled(prediction: Prediction) -> Callable[..., Any]:
     return jax.jit(prediction)
 
 

@@ -64,7 +64,7 @@ def run_traced(problem: Problem, options: Options) -> Fit:
     )
 
 
-def _search(residual: Callable, problem: Problem, options: Options, x: Array, task: Task) -> State:
+def _search(residual: Callable[..., Any], problem: Problem, options: Options, x: Array, task: Task) -> State:
     """Through the stages in one scan, then over everything."""
     evaluate, never = evaluations(residual, compiled=False), jnp.iinfo(jnp.int32).max
     state = start(jnp.clip(x, task.lower, task.upper), len(task.weights), options.max_iterations)
@@ -80,7 +80,7 @@ def _search(residual: Callable, problem: Problem, options: Options, x: Array, ta
     return advance(evaluate, LOSSES[options.loss], state, task, never)
 
 
-def _gradient(residual: Callable, loss: Any, x: Array, task: Task) -> Array:
+def _gradient(residual: Callable[..., Any], loss: Any, x: Array, task: Task) -> Array:
     """The gradient of the cost that is minimised."""
 
     def cost(x: Array) -> Array:
@@ -91,7 +91,7 @@ def _gradient(residual: Callable, loss: Any, x: Array, task: Task) -> Array:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _optimum(gradient: Callable, x: Array, task: Task) -> Array:
+def _optimum(gradient: Callable[..., Any], x: Array, task: Task) -> Array:
     """x, whose derivative is that of the point where the gradient is zero:
 
     dx = -H^-1 d(gradient),   H = d gradient / dx,   over what is not on a bound

@@ -119,7 +119,7 @@ class Layout:
             ) from None
         return values
 
-    def names(self, of_path: Callable[[tuple], str] = keystr) -> tuple[str, ...]:
+    def names(self, of_path: Callable[[tuple[Any, ...]], str] = keystr) -> tuple[str, ...]:
         """One name for each number: "['ks']", "['ks'][3]"; with `readable` "ks", "ks[3]"."""
         example = jax.tree.unflatten(self.structure, list(range(len(self.shapes))))
         names = []
@@ -130,7 +130,7 @@ class Layout:
         return tuple(names)
 
 
-def readable(path: tuple) -> str:
+def readable(path: tuple[Any, ...]) -> str:
     """A leaf's place in words: keys of a dict without quotes and brackets at the outermost level."""
     key = getattr(path[0], "key", None) if path else None
     if isinstance(key, str):
@@ -138,12 +138,12 @@ def readable(path: tuple) -> str:
     return "params" + keystr(path)
 
 
-def _in_plain_containers(path: tuple) -> bool:
+def _in_plain_containers(path: tuple[Any, ...]) -> bool:
     """Whether a leaf is in dicts, lists and tuples, where a person put it, and not part of a class."""
     return all(isinstance(key, (jax.tree_util.DictKey, jax.tree_util.SequenceKey)) for key in path)
 
 
-def _refuse_not_floating(path: tuple, x: Any) -> None:
+def _refuse_not_floating(path: tuple[Any, ...], x: Any) -> None:
     where = f"params{keystr(path)}"
     try:
         dtype = jnp.result_type(x)

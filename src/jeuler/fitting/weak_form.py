@@ -46,6 +46,14 @@ class WeakForm:
 class Rows:
     """The rows of the linear problem: one for each free particle, bump and component."""
 
+    bump: np.ndarray
+    second: np.ndarray
+    tracks: Tracks
+    mass: np.ndarray
+    used: np.ndarray
+    number: np.ndarray
+    count: int
+
     def __init__(self, tracks: Tracks, mass: np.ndarray, edges: list[np.ndarray], half_width: float) -> None:
         self.bump, self.second, inside = bumps(tracks.times, half_width)
         self.tracks, self.mass = tracks, mass
@@ -173,7 +181,9 @@ def _free_fields(scene: Scene, places: Places, owner: int) -> dict[str, str]:
     return found
 
 
-def _spring_terms(rows: Rows, force: Springs, k: int, scene: Scene, places: Places) -> tuple[np.ndarray, list] | None:
+def _spring_terms(
+    rows: Rows, force: Springs, k: int, scene: Scene, places: Places
+) -> tuple[np.ndarray, list[Any]] | None:
     """What springs add that is known, and the columns of ks, kd and ks L."""
     free = _free_fields(scene, places, k)
     pairs = np.asarray(force.edges[:])
@@ -225,7 +235,7 @@ def _summed(matrix: Any) -> Any:
     return csc_matrix(matrix.sum(axis=1))
 
 
-def _terms_of(rows: Rows, force: Any, k: int, scene: Scene, places: Places) -> tuple[np.ndarray, list]:
+def _terms_of(rows: Rows, force: Any, k: int, scene: Scene, places: Places) -> tuple[np.ndarray, list[Any]]:
     """What any other force adds that is known, and the columns of those of its free numbers that enter linearly."""
     from scipy.sparse import csc_matrix
 
@@ -268,7 +278,7 @@ def _terms_of(rows: Rows, force: Any, k: int, scene: Scene, places: Places) -> t
 
 
 def _gathered(
-    scene: Scene, places: Places, start: dict[str, Any], targets: list, sizes: list[int], found: np.ndarray
+    scene: Scene, places: Places, start: dict[str, Any], targets: list[Any], sizes: list[int], found: np.ndarray
 ) -> dict[str, Any]:
     """The starting values with what was found in its places; what was not determined (NaN) stays."""
     parts = dict(zip(targets, np.split(found, np.cumsum(sizes)[:-1]), strict=True))

@@ -98,7 +98,7 @@ class Gust:
     velocity: Parameter
     period: Parameter
 
-    limits: ClassVar = {"velocity": ("", "m/s"), "period": ("> 0", "s")}
+    limits: ClassVar[dict[str, Any]] = {"velocity": ("", "m/s"), "period": ("> 0", "s")}
 
     def __post_init__(self) -> None:
         store_as_float(self, "velocity", "period")
@@ -142,7 +142,7 @@ class Turbulence:
     phases: Parameter
     frequencies: Parameter
 
-    limits: ClassVar = {"speed": (">= 0", "m/s"), "size": ("> 0", "m"), "time": ("> 0", "s")}
+    limits: ClassVar[dict[str, Any]] = {"speed": (">= 0", "m/s"), "size": ("> 0", "m"), "time": ("> 0", "s")}
     may_be_infinite: ClassVar = ("time",)
 
     def __post_init__(self) -> None:
@@ -219,7 +219,7 @@ class Vortex:
     core: Parameter
     axis: Parameter = default((0.0, 0.0, 1.0))
 
-    limits: ClassVar = {"circulation": ("", "m^2/s"), "core": ("> 0", "m"), "axis": ("", "")}
+    limits: ClassVar[dict[str, Any]] = {"circulation": ("", "m^2/s"), "core": ("> 0", "m"), "axis": ("", "")}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving("Vortex.center", self.center))

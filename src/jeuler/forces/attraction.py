@@ -47,7 +47,7 @@ class PointAttractor:
     softening: Parameter
     power: float = 2
 
-    limits: ClassVar = {"center": ("", "m"), "strength": ("", ""), "softening": ("> 0", "m")}
+    limits: ClassVar[dict[str, Any]] = {"center": ("", "m"), "strength": ("", ""), "softening": ("> 0", "m")}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving("PointAttractor.center", self.center))

@@ -96,7 +96,7 @@ def stiffness(drags: Sequence[Resistance], v: Sequence[Array], others: Sequence[
     return c / 2 + slope + 2 * spread + root((c - 2 * spread) ** 2 + 4 * both) / 2
 
 
-def _mean_wind(quadratic: Sequence[Resistance]) -> tuple[Array, Sequence[Array] | None, list]:
+def _mean_wind(quadratic: Sequence[Resistance]) -> tuple[Array, Sequence[Array] | None, list[Any]]:
     """q, the mean wind w of quadratic drags (None: 0), and w_j - w of each; none of these where there is one wind."""
     q = total(d.quadratic for d in quadratic)
     blowing = [d for d in quadratic if d.air is not None]

@@ -96,7 +96,7 @@ class _OnStrands:
     strands: Any
     rest_position: Array
 
-    limits: ClassVar = {
+    limits: ClassVar[dict[str, Any]] = {
         "rest_position": ("", "m"),
         "stiffness": (">= 0", "N/m"),
         "damping": (">= 0", "N s/m"),

@@ -43,7 +43,7 @@ class Viscosity:
     edges: ParticleIndices
     coefficient: Parameter
 
-    limits: ClassVar = {"coefficient": (">= 0", "N s/m")}
+    limits: ClassVar[dict[str, Any]] = {"coefficient": (">= 0", "N s/m")}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
@@ -103,7 +103,7 @@ class Bending:
     stiffness: Parameter
     rest_angle: Parameter = default(0.0)
 
-    limits: ClassVar = {"stiffness": (">= 0", "N m/rad^2"), "rest_angle": ("", "rad")}
+    limits: ClassVar[dict[str, Any]] = {"stiffness": (">= 0", "N m/rad^2"), "rest_angle": ("", "rad")}
 
     def __post_init__(self) -> None:
         triples = Indices(self.triples, "Bending.triples", "integers of shape (triple, 3), particle indices")

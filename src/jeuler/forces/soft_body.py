@@ -32,7 +32,7 @@ def rotation_of(a: Array) -> Array:
 
 
 @rotation_of.defjvp
-def _rotation_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+def _rotation_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     (a,), (da,) = primals, tangents
     r = rotation_of(a)
     return r, r @ turning(r.T @ a, r.T @ da - da.T @ r)
@@ -105,7 +105,11 @@ class ShapeMatching:
     stiffness: Parameter
     damping: Parameter = default(0.0)
 
-    limits: ClassVar = {"rest_position": ("", "m"), "stiffness": (">= 0", "N/m"), "damping": (">= 0", "N s/m")}
+    limits: ClassVar[dict[str, Any]] = {
+        "rest_position": ("", "m"),
+        "stiffness": (">= 0", "N/m"),
+        "damping": (">= 0", "N s/m"),
+    }
 
     def __post_init__(self) -> None:
         given = list(self.particles) if isinstance(self.particles, range) else self.particles

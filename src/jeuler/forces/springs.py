@@ -90,7 +90,7 @@ class Springs:
     kd: Parameter
     rest_length: Parameter
 
-    limits: ClassVar = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
+    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))

@@ -68,11 +68,11 @@ class Equation:
     """
 
     forces: tuple[Prepared, ...]
-    effects: tuple
+    effects: tuple[Any, ...]
     context: Context
 
     @classmethod
-    def of(cls, forces: Iterable, effects: Iterable, context: Context) -> Equation:
+    def of(cls, forces: Iterable[Any], effects: Iterable[Any], context: Context) -> Equation:
         prepared = []
         for k, force in enumerate(forces):
             kernel = force.prepare(context) if hasattr(force, "prepare") else force

@@ -25,7 +25,9 @@ from jeuler.steps.explicit import Step
 class Moment:
     """The state at a point within a step: whole, and in the parts in which it is carried, each made when asked for."""
 
-    def __init__(self, *, state: ParticleState | None = None, parts: tuple[tuple, ParticleState] | None = None) -> None:
+    def __init__(
+        self, *, state: ParticleState | None = None, parts: tuple[tuple[Any, ...], ParticleState] | None = None
+    ) -> None:
         if state is not None:
             self.state = state
         if parts is not None:
@@ -36,7 +38,7 @@ class Moment:
         return join_state(self.parts)
 
     @functools.cached_property
-    def parts(self) -> tuple[tuple, ParticleState]:
+    def parts(self) -> tuple[tuple[Any, ...], ParticleState]:
         return split_state(self.state)
 
 
@@ -58,7 +60,7 @@ class SceneStep:
         return cls(scene, grid, step, key, Equation.of(scene.forces, scene.effects, context), **how)
 
     @functools.cached_property
-    def advance(self) -> Callable:
+    def advance(self) -> Callable[..., Any]:
         step = self.step if hasattr(self.step, "increment") else on_arrays(self.step)
         return advance_by(step, compensated=self.compensated)
 
@@ -88,14 +90,14 @@ class SceneStep:
         if self.scene.effects and rest.alive is not None:
             yield "dead slots", Moment(state=zero_dead_slots(moment.state)), remainder
 
-    def effects(self, n: Array, *, early: bool) -> Iterator[tuple[str, Callable]]:
+    def effects(self, n: Array, *, early: bool) -> Iterator[tuple[str, Callable[..., Any]]]:
         """Name, and ``effect(t, dt, previous, state)`` with the key of step n, of those before the motion, or after."""
         for k, effect in enumerate(self.scene.effects):
             if (acts(effect) == BEFORE) == early:
                 key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n), k)
                 yield f"effects[{k}] {name_of(effect)}", functools.partial(with_previous(effect, ""), key=key)
 
-    def field(self, t: Any, motion: tuple, attributes: Any) -> tuple:
+    def field(self, t: Any, motion: tuple[Any, ...], attributes: Any) -> tuple[Any, ...]:
         """The equation of motion by component, as the motion is carried from step to step."""
         position, velocity = map(stack, motion)
         equation = self.equation

@@ -50,10 +50,10 @@ def plot_work_precision(table: Any, ax: Any = None) -> Any:
     return ax
 
 
-def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list]:
+def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list[Any]]:
     methods = list(dict.fromkeys(row["method"] for row in table.rows))
     colours = plt.get_cmap("tab10" if len(methods) <= 10 else "tab20")
-    labels: list[list] = [[] for _ in axes]
+    labels: list[list[Any]] = [[] for _ in axes]
     for index, method in enumerate(methods):
         for dtype in dtypes:
             own = [r for r in table.rows if (r["method"], r["dtype"]) == (method, dtype) and _drawable(r)]
@@ -71,7 +71,7 @@ def _draw(axes: Any, table: Any, dtypes: list[str]) -> list[list]:
     return labels
 
 
-def _finish(axes: Any, labels: list[list]) -> None:
+def _finish(axes: Any, labels: list[list[Any]]) -> None:
     """What needs the final limits of the axes: the labels, last."""
     for each, own_labels in zip(axes, labels, strict=True):
         each.grid(True, which="major", color="0.92", linewidth=0.6)
@@ -89,7 +89,7 @@ def _seconds(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _lines(axes: Any, rows: list[dict], name: str, colour: Any, labels: list[list]) -> None:
+def _lines(axes: Any, rows: list[dict[Any, Any]], name: str, colour: Any, labels: list[list[Any]]) -> None:
     """One method in one precision: its fixed steps as a line, its tolerances as a dotted one."""
     fixed = sorted((r for r in rows if math.isfinite(r["dt"])), key=lambda r: -r["dt"])
     adaptive = sorted((r for r in rows if math.isfinite(r["tolerance"])), key=lambda r: -r["tolerance"])
@@ -106,7 +106,7 @@ def _lines(axes: Any, rows: list[dict], name: str, colour: Any, labels: list[lis
             labels[place].append((x[-1], y[-1], label, colour))
 
 
-def _drawable(row: dict) -> bool:
+def _drawable(row: dict[Any, Any]) -> bool:
     return 0 < row["error_final_relative"] < WORST
 
 

@@ -96,7 +96,7 @@ class Uniform(Sampler):
     low: Parameter
     high: Parameter
 
-    limits: ClassVar = {"low": ("", ""), "high": ("", "")}
+    limits: ClassVar[dict[str, Any]] = {"low": ("", ""), "high": ("", "")}
 
     def __post_init__(self) -> None:
         store_as_float(self, "low", "high")
@@ -136,7 +136,7 @@ class Normal(Sampler):
     mean: Parameter
     deviation: Parameter
 
-    limits: ClassVar = {"mean": ("", ""), "deviation": (">= 0", "")}
+    limits: ClassVar[dict[str, Any]] = {"mean": ("", ""), "deviation": (">= 0", "")}
 
     def __post_init__(self) -> None:
         store_as_float(self, "mean", "deviation")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +74,7 @@ class FromDisc(Sampler):
     radius: Parameter
     normal: Parameter = default((0.0, 0.0, 1.0))
 
-    limits: ClassVar = {"center": ("", "m"), "radius": (">= 0", "m"), "normal": ("", "")}
+    limits: ClassVar[dict[str, Any]] = {"center": ("", "m"), "radius": (">= 0", "m"), "normal": ("", "")}
 
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius", "normal")
@@ -119,7 +119,7 @@ class FromSphere(Sampler):
     radius: Parameter
     surface: bool = False
 
-    limits: ClassVar = {"center": ("", "m"), "radius": (">= 0", "m")}
+    limits: ClassVar[dict[str, Any]] = {"center": ("", "m"), "radius": (">= 0", "m")}
 
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius")
@@ -210,7 +210,7 @@ class Cone(Sampler):
     speed: SampledParameter
     angle: Parameter = default(0.0)
 
-    limits: ClassVar = {"direction": ("", ""), "angle": (">= 0", "rad")}
+    limits: ClassVar[dict[str, Any]] = {"direction": ("", ""), "angle": (">= 0", "rad")}
 
     def __post_init__(self) -> None:
         store_as_float(self, "direction", "angle")

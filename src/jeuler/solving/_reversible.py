@@ -48,7 +48,7 @@ def check(f: VectorField, t: Any, y: PyTree, args: PyTree, step: Any, compensate
         )
 
 
-def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyTree, Callable]:
+def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyTree, Callable[..., Any]]:
     """The start on its grid of quanta, and ``between_saves(n, first_nonfinite, y)``, the steps to the next saved state.
 
     A plain run, before all else, finds the largest number of each array, which sets its quantum. Both rounding and that
@@ -163,7 +163,7 @@ def _on_grid_jvp(primals, tangents):
     return _on_grid(*primals), tangents[0]
 
 
-def _largest(field: Callable, y: PyTree, parameters: list[Array], num_steps: int) -> PyTree:
+def _largest(field: Callable[..., Any], y: PyTree, parameters: list[Array], num_steps: int) -> PyTree:
     """The largest magnitude in each array of y over a plain run, whose clock is the number of the step."""
 
     def magnitude(y):

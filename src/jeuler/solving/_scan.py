@@ -205,7 +205,7 @@ class Grid:
     segment: int | None
 
     @classmethod
-    def checked(cls, dt, num_steps, t0, save_every, checkpoint, dtype) -> Grid:
+    def checked(cls, dt: Any, num_steps: Any, t0: Any, save_every: Any, checkpoint: Checkpoint, dtype: Any) -> Grid:
         """The grid of these arguments, or one ValueError that says which is wrong."""
         num_steps = checks.count("num_steps", num_steps)
         save_every = checks.count("save_every", save_every, least=1)
@@ -301,7 +301,7 @@ def _segment_length(checkpoint: Checkpoint, num_steps: int) -> int | None:
     return checks.count("checkpoint", checkpoint, least=1)
 
 
-def _scan(body: Callable, carry: PyTree, count: int, segment: int | None) -> tuple[PyTree, PyTree]:
+def _scan(body: Callable[..., Any], carry: PyTree, count: int, segment: int | None) -> tuple[PyTree, PyTree]:
     """Scan ``body`` count times; with a segment, reverse mode keeps only the carries between segments."""
     if count == 1:  # no loop, and outputs with a leading axis of one
         carry, out = body(carry, None)
@@ -338,7 +338,7 @@ def check_save(save: Any) -> None:
         checks.function("save", save, "(t, y) -> what is kept", "write save=lambda t, y: y.position, say")
 
 
-def saved_form(save: Callable | None, t: Array, y: PyTree) -> None:
+def saved_form(save: Callable[..., Any] | None, t: Array, y: PyTree) -> None:
     """One ValueError if what save keeps of a state is not made of arrays."""
     if save is None:
         return
@@ -347,7 +347,7 @@ def saved_form(save: Callable | None, t: Array, y: PyTree) -> None:
         raise ValueError("save must return arrays, what is kept of a saved state, got None; write return, or save=None")
 
 
-def advance_by(step: Any, *, compensated: bool) -> Callable:
+def advance_by(step: Any, *, compensated: bool) -> Callable[..., Any]:
     """The step on the pair (y, the remainder that rounding has cut off y so far; None in plain sums).
 
     Reverse mode keeps what an explicit step starts from and works the rest out again: that is less work than to store

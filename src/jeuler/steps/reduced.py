@@ -58,7 +58,7 @@ class Reduced:
     lift: Callable[[np.ndarray], np.ndarray]
 
 
-def reduced_pair(product: Callable, n: int, weights: np.ndarray) -> Reduced:
+def reduced_pair(product: Callable[..., Any], n: int, weights: np.ndarray) -> Reduced:
     """A pair (position, velocity) of equal halves, both in the space of the fastest of K + s C.
 
     x' = v, v' = -K x - C v;  in the coordinates sqrt(m) x K and C of springs are symmetric, and so they stay.
@@ -91,14 +91,14 @@ def reduced_pair(product: Callable, n: int, weights: np.ndarray) -> Reduced:
     return Reduced(np.stack(columns, axis=1), like, lift)
 
 
-def reduced_whole(product: Callable, n: int) -> Reduced:
+def reduced_whole(product: Callable[..., Any], n: int) -> Reduced:
     """A state without halves, in the Krylov space of J."""
     basis = arnoldi(product, np.random.default_rng(0).standard_normal(n), MOST_WHOLE if n <= MANY else MOST)
     matrix = np.stack([basis.T @ product(column) for column in basis.T], axis=1)
     return Reduced(matrix, jnp.zeros(basis.shape[1]), lambda z: basis @ z)
 
 
-def symmetric_weights(product: Callable, n: int, masses: Any) -> np.ndarray:
+def symmetric_weights(product: Callable[..., Any], n: int, masses: Any) -> np.ndarray:
     """Square roots of the masses, one a number of the position, where they make K symmetric; ones where not."""
     half, ones = n // 2, np.ones(n // 2)
     mass = np.asarray(masses, dtype=float).ravel() if masses is not None else np.ones(0)
@@ -118,7 +118,12 @@ def symmetric_weights(product: Callable, n: int, masses: Any) -> np.ndarray:
 class Runs:
     """Runs of the step on the linearised equation in full size: whether a perturbation grows at a dt."""
 
-    def __init__(self, field: Callable, step: Step, like: Any, seconds: float) -> None:
+    run: Callable[..., Any]
+    seconds: float
+    begun: float
+    length: int
+
+    def __init__(self, field: Callable[..., Any], step: Step, like: Any, seconds: float) -> None:
         unflatten = trees.real_vector(like)[1]
 
         @jax.jit

@@ -57,7 +57,7 @@ class StabilityLimit(float):
         limit.lower, limit.upper, limit.known, limit.reason = lower, upper, known, reason
         return limit
 
-    def __getnewargs__(self) -> tuple:
+    def __getnewargs__(self) -> tuple[Any, ...]:
         return float(self), self.lower, self.upper, self.known, self.reason
 
     def _repr_html_(self) -> str:
@@ -165,11 +165,21 @@ class Spectrum:
 class Linearisation:
     """The linear field J u around states of one form: as products, as a matrix where it is small, or a part of it."""
 
+    neutral: float
+    y: PyTree
+    args: PyTree
+    flat: Any
+    unflatten: Callable[[Any], PyTree]
+    images: dict[Any, Callable[..., Any]]
+    field: Callable[[Any, Any], Any]
+    product: Callable[..., Any]
+    products: Callable[..., Any]
+
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
         self.neutral = NEUTRAL * float(np.sqrt(np.finfo(trees.time_dtype(y)).eps))  # the data's own roundoff
         self.y, self.args = cast(y, np.float64), cast(args, np.float64)
         self.flat, self.unflatten = trees.real_vector(self.y)
-        self.images: dict[Any, Callable] = {}
+        self.images: dict[Any, Callable[..., Any]] = {}
 
         def real_field(t, flat):
             slope = f(t, self.unflatten(flat), self.args)
