@@ -99,6 +99,19 @@ def test_a_name_or_clock_without_unit_is_a_warning(folder):
     assert "Neither name nor unit says what value is" in second
 
 
+def test_numbers_too_large_for_their_unit_are_a_warning(folder):
+    (folder / "bare.csv").write_text(
+        "t,y,theta\n" + quirks.table(quirks.T, quirks.acceleration(), 900 * quirks.swing())
+    )
+    (warning,) = selected("bare.csv", "--columns", "y").warnings
+    assert "y has no unit and an extent of" in warning
+    assert "give --unit, such as --unit y=m/s^2" in warning
+    assert selected("bare.csv", "--columns", "y", "--unit", "y=m/s^2").quantity == "acceleration"
+    (warning,) = selected("bare.csv", "--columns", "theta").warnings
+    assert "--unit theta=deg" in warning
+    assert selected("bare.csv", "--columns", "theta", "--unit", "theta=deg").warnings == ()
+
+
 def test_oversampled_rows_are_averaged_and_it_is_said(folder):
     t = np.arange(200_000) / 5_000
     np.savetxt("fast.csv", np.column_stack([t, quirks.swing(t)]), delimiter=",", header="t,x", comments="", fmt="%.6f")

@@ -126,6 +126,7 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
             f"Correct it with --observe or --unit."
         )
     unit = columns[0].unit if unknown else UNITS[quantity]
+    warnings += _size_words(columns, quantity, values)
     drive = None
     if arguments.input is not None:
         drive = recording.values[:, recording.columns.index(input_column(recording, arguments))][keep]
@@ -148,6 +149,20 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
     driven = (f"{arguments.input} is the measured force u(t).",) if drive is not None else ()
     gaps = (f"The record has {clock.gaps} gaps, the longest of {clock.longest_gap:.3g} s.",) if clock.gaps else ()
     return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *driven, *gaps)))
+
+
+def _size_words(columns: list[Column], quantity: str, values: np.ndarray) -> list[str]:
+    """A doubt where no unit is given and the numbers are larger than such a motion is as a rule."""
+    usual = {"position": 2.0, "angle": 4 * np.pi}.get(quantity, np.inf)
+    extent = float(np.nanmax(np.nanmax(values, axis=0) - np.nanmin(values, axis=0)))
+    if any(column.unit for column in columns) or extent <= usual:
+        return []
+    others = "another unit or an acceleration" if quantity == "position" else "degrees"
+    name = columns[0].name
+    return [
+        f"{listed([c.name for c in columns])} has no unit and an extent of {extent:.3g}: taken in {UNITS[quantity]}. "
+        f"If it is {others}, give --unit, such as --unit {name}={'m/s^2' if quantity == 'position' else 'deg'}."
+    ]
 
 
 def thinned(measured: Measurement) -> Measurement:
