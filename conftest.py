@@ -17,6 +17,8 @@ FAST = (
     "tests/solving/test_scan.py",
     "tests/steps/test_explicit.py",
     "tests/test_api.py",
+    "tests/test_contributing.py",
+    "tests/test_skips.py",
 )
 
 
