@@ -14,7 +14,7 @@ from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.components import split, stack
 from jeuler.particles.equation import Equation
-from jeuler.particles.fields import BEFORE, acts, name_of
+from jeuler.particles.fields import BEFORE, acts, declared, name_of
 from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
@@ -95,7 +95,8 @@ class SceneStep:
         for k, effect in enumerate(self.scene.effects):
             if (acts(effect) == BEFORE) == early:
                 key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n), k)
-                yield f"effects[{k}] {name_of(effect)}", functools.partial(with_previous(effect, ""), key=key)
+                clock = {"clock": (n, self.grid.t0)} if declared(effect, "counts_steps", False) else {}
+                yield f"effects[{k}] {name_of(effect)}", functools.partial(with_previous(effect, ""), key=key, **clock)
 
     def field(self, t: Any, motion: tuple[Any, ...], attributes: Any) -> tuple[Any, ...]:
         """The equation of motion by component, as the motion is carried from step to step."""

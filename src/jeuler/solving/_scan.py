@@ -209,6 +209,7 @@ class Grid:
         """The grid of these arguments, or one ValueError that says which is wrong."""
         num_steps = checks.count("num_steps", num_steps)
         save_every = checks.count("save_every", save_every, least=1)
+        check_counter(num_steps, save_every)
         if num_steps % save_every:
             raise ValueError(
                 f"save_every must divide num_steps, got save_every={save_every} and num_steps={num_steps}; "
@@ -222,6 +223,25 @@ class Grid:
     def clock(self, n: Array) -> Array:
         """t0 + n dt."""
         return self.t0 + n.astype(self.dt.dtype) * self.dt
+
+
+COUNTER = 2**31 - 1  # the most steps that an int32 counts
+
+
+def check_counter(num_steps: int, save_every: int) -> None:
+    """One ValueError if the run has more steps than its counter can count, which would turn time negative."""
+    if num_steps <= COUNTER:
+        return
+    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        raise ValueError(
+            f"num_steps must be at most {COUNTER:,} where integers have 32 bits, got {num_steps:,}; "
+            f'write jax.config.update("jax_enable_x64", True), or go on from the last state in a second run with its t0'
+        )
+    if max(save_every, num_steps // save_every) > COUNTER:
+        raise ValueError(
+            f"save_every must be such that neither it nor num_steps / save_every is above {COUNTER:,}, "
+            f"got {save_every:,} of {num_steps:,} steps; take save_every={2**20:,}"
+        )
 
 
 def check_time_step(dt: Any, t0: Any, dtype: Any) -> None:
@@ -284,7 +304,8 @@ def scan_grid(
         return carry, saved(carry)
 
     saved_form(save, grid.t0, start[0])
-    carry = (jnp.int32(0), jnp.int32(-1), start)
+    counter = jnp.int32 if grid.num_steps <= COUNTER else jnp.int64
+    carry = (jnp.zeros((), counter), jnp.full((), -1, counter), start)
     blocks = None if grid.segment is None else max(1, grid.segment // grid.save_every)
     (_, first_nonfinite, _), rest = _scan(one_save, carry, grid.num_steps // grid.save_every, blocks)
     t, y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), saved(carry), rest)

@@ -229,7 +229,7 @@ def _system(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any, velocity_deci
     roundoff = trees.largest(y)
     if _velocity_decides(f, t, y, args) if velocity_decides is None else velocity_decides:
         (position, _), pair = trees.parts(y)
-        roundoff = jnp.maximum(trees.largest(y), trees.largest(position) / dt)
+        roundoff = jnp.maximum(trees.largest(y), trees.largest(position) / jnp.abs(dt))
 
         def unknown(z):
             return pair.flatten_up_to(z)[1]
