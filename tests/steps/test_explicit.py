@@ -101,3 +101,18 @@ def test_symplectic_euler_takes_any_container_of_two(pair):
 
     y = jeuler.solve(f, pair(1.0, 0.0), dt=0.1, num_steps=1, step=jeuler.symplectic_euler_step).y
     np.testing.assert_allclose([leaf[-1] for leaf in jax.tree.leaves(y)], [0.99, -0.1])
+
+
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.heun_step, jeuler.rk4_step])
+def test_a_turn_of_a_small_loop_and_of_its_reverse_is_one_kernel(step):
+    """Where XLA makes many kernels of a turn, the reverse of RK4 takes 60 to 90 times the forward run."""
+
+    def lorenz(t, y, p):
+        return jnp.stack([p[0] * (y[1] - y[0]), y[0] * (p[1] - y[2]) - y[1], y[0] * y[1] - p[2] * y[2]])
+
+    def final(y, p):
+        return jeuler.solve(lorenz, y, args=p, dt=1e-3, num_steps=500, save_every=500, step=step).y[-1].sum()
+
+    start, p = jnp.ones(3, jnp.float32), jnp.array([10.0, 28.0, 8 / 3], jnp.float32)
+    text = jax.jit(jax.grad(final, argnums=(0, 1))).lower(start, p).compile().as_text()
+    assert text.count('xla_cpu_small_call="true"') == 2  # there and back
