@@ -84,7 +84,11 @@ def as_float(x: ArrayLike | None) -> Array | None:
         return x
     if isinstance(x, (int, float)) and not isinstance(x, bool):
         return jnp.asarray(float(x))
-    kind = jnp.result_type(x) if isinstance(x, jax.Array) else np.asarray(x).dtype
+    if any(
+        isinstance(part, jax.Array) for part in jax.tree.leaves(x)
+    ):  # NumPy cannot look at a list with traced numbers
+        x = jnp.asarray(x)
+    kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer) or kind == np.dtype(object)):
         raise TypeError(f"{kind} is not real")
     x = jnp.asarray(x)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jax.interpreters import ad, batching, mlir, partial_eval
 
+from jeuler._jax import platforms
 from jeuler._jax.batch_last import batch_last, fits, reached
 from jeuler._jax.jaxpr import Jaxpr, Primitive, evaluate
 
@@ -184,7 +185,7 @@ def _batch(axis_data, operands, new_axes, *, jaxpr, size, axes, batched, differe
 
 def _is_better_last(jaxpr: Jaxpr, new: Sequence[bool], count: int) -> bool:
     longest = max(aval.shape[-1] if aval.ndim else 1 for aval in _chosen(jaxpr.in_avals, new))
-    return count >= MANY and longest <= SHORT and fits(jaxpr.jaxpr, new)
+    return platforms.batch_last() and count >= MANY and longest <= SHORT and fits(jaxpr.jaxpr, new)
 
 
 @functools.lru_cache(maxsize=256)

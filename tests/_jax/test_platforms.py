@@ -1,0 +1,54 @@
+"""Programs lower for accelerators; whether they run well there is for a machine that has one."""
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+from jeuler._jax import platforms
+
+GRID = {"dt": 0.01, "num_steps": 4, "save_every": 2}
+STATE = jeuler.ParticleState(np.eye(3, 2), np.zeros((3, 2)))
+
+
+def solved(k):
+    return jeuler.solve(lambda t, y, k: -k * y, jnp.ones(3), args=k, step=jeuler.rk4_step, **GRID).y.sum()
+
+
+def springs(k):
+    scene = jeuler.Scene((jeuler.Springs([(0, 1), (1, 2)], k, 0.1, 1.0), jeuler.Gravity([0.0, -9.8])))
+    return jeuler.simulate(scene, STATE, **GRID).y.position.sum()
+
+
+def collisions(k):
+    floor = jeuler.Collisions((jeuler.Plane([0.0, -k], [0.0, 1.0]),), pairs=[(0, 1)], radius=0.1)
+    return jeuler.simulate(jeuler.Scene((jeuler.Gravity([0.0, -9.8]),), (floor,)), STATE, **GRID).y.position.sum()
+
+
+def births(k):
+    emitter = jeuler.Emitter(100.0, position=[0.0, 0.0], velocity=jeuler.Cone([0.0, 1.0], speed=k, angle=0.2))
+    scene = jeuler.Scene((jeuler.Gravity([0.0, -9.8]),), (emitter, jeuler.Lifetime(1.0)))
+    return jeuler.simulate(scene, jeuler.empty_pool(8, 2), key=jax.random.key(0), **GRID).y.position.sum()
+
+
+@pytest.mark.parametrize("function", [solved, springs, collisions, births])
+def test_runs_and_gradients_lower_for_accelerators(function):
+    run = jax.jit(jax.value_and_grad(function))
+    exported = jax.export.export(run, platforms=["cuda", "rocm", "tpu"])(jnp.float32(1.0))
+    assert set(exported.platforms) == {"cuda", "rocm", "tpu"}
+
+
+def test_ensembles_lower_for_accelerators_in_either_order(monkeypatch):
+    for last in (True, False):
+        monkeypatch.setitem(platforms.BATCH_LAST, jax.default_backend(), last)
+        run = jax.jit(lambda ks: jax.vmap(springs)(ks))
+        jax.export.export(run, platforms=["cuda", "tpu"])(jnp.ones(64))
+
+
+def test_the_order_of_a_batch_is_chosen_by_the_table(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not platforms.batch_last()
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    assert platforms.batch_last()
