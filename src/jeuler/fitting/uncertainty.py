@@ -18,7 +18,7 @@ import numpy as np
 from jeuler.fitting.least_squares import column_norms, namespace
 
 MOST_LAGS = 8
-LARGE = 2**24  # numbers in a Jacobian beyond which fewer lags are looked at
+LARGE = 2**22  # numbers in a Jacobian beyond which a bound on the correlation's effect must do
 Series = tuple[tuple[int, int], ...]  # (times, channels) of each part of the residual vector
 
 
@@ -107,6 +107,8 @@ def uncertainty(
     size = 1.0 if absolute else variance
     white = half @ shape @ (basis.T @ basis) @ shape @ half.T * size
     noise = autoregression(gamma, xp.sum(counted), xp)
+    if xp is np and noise.order == 0:
+        return _result(white, white, gamma, enough, d, n, absolute, variance, xp)
     unit = 1 / xp.where(gamma[0] > 0, gamma[0], 1) if absolute else 1.0
     meat = unit * _through(basis, noise, series, xp)
     correlated = half @ shape @ meat @ shape @ half.T
@@ -114,14 +116,22 @@ def uncertainty(
     correlated = correlated * wider[:, None] * wider[None, :]
     use = xp.all(xp.isfinite(correlated)) & enough & (noise.order > 0)
     correlated = xp.where(use, correlated, white)
+    return _result(correlated, white, gamma, enough, d, n, absolute, variance, xp)
+
+
+def _result(
+    correlated: Any, white: Any, gamma: Any, enough: Any, d: Directions, n: int, absolute: bool, variance: Any, xp: Any
+) -> Uncertainty:
+    """The two covariances, what is blind, and the correlation from one sample to the next."""
     if not absolute:  # as many unknowns as data: nothing is left over to tell the noise from
         nothing = xp.where(xp.eye(n, dtype=bool), xp.inf, 0.0)
         white, correlated = (xp.where(enough, c, nothing) for c in (white, correlated))
-    # what takes part in a direction that nothing shows
     silent = 1 - xp.sum(xp.where(d.seen, d.vectors, 0) ** 2, axis=1)
-    blind = silent > 1e-6
-    rho = xp.where(gamma[0] > 0, gamma[1] / xp.where(gamma[0] > 0, gamma[0], 1), 0.0) if lags else xp.asarray(0.0)
-    return Uncertainty(correlated, white, blind, xp.clip(rho, -1, 1), variance)
+    rho = xp.asarray(0.0)
+    if len(gamma) > 1:
+        rho = xp.where(gamma[0] > 0, gamma[1] / xp.where(gamma[0] > 0, gamma[0], 1), 0.0)
+    # blind: what takes part in a direction that nothing shows
+    return Uncertainty(correlated, white, silent > 1e-6, xp.clip(rho, -1, 1), variance)
 
 
 def _inverse(matrix: Any, seen: Any, xp: Any) -> Any:
@@ -137,7 +147,7 @@ def _lags(series: Series, n: int, m: int) -> int:
     """How many lags the series are long enough for; 0 where nothing can be said."""
     longest = max((times for times, _ in series), default=0)
     most = 2 if m * n > LARGE else MOST_LAGS
-    return max(0, min(most, (longest - n - 2) // 5, longest // 5))
+    return max(0, min(most, (m - n - 2) // 5, longest // 5))
 
 
 def _parts(x: Any, series: Series) -> list[Any]:
@@ -165,12 +175,19 @@ def autocovariances(residual: Any, counted: Any, basis: Any, series: Series, lag
     E[r^T U_h r] = sum_j gamma_j tr(U_h M V_j M), solved for gamma; U and V shift by h and j samples.
     """
     kept, mask = _parts(xp.where(counted, residual, 0), series), _parts(xp.where(counted, 1.0, 0.0), series)
+    if basis.shape[0] > 50 * basis.shape[1] and basis.size > LARGE // 4:  # then a factor will do
+        plain = [_inner(kept, [_both_sides(r, h, xp) for r in kept], xp) / (2 if h else 1) for h in range(lags + 1)]
+        pairs = [_inner(mask, [_both_sides(r, h, xp) for r in mask], xp) / (2 if h else 1) for h in range(lags + 1)]
+        return xp.stack([xp.asarray(a) for a in plain]) / (xp.stack([xp.asarray(a) for a in pairs]) - basis.shape[1])
     shifted = [_parts(basis, series)]
     shifted += [[_both_sides(q, h, xp) for q in shifted[0]] for h in range(1, lags + 1)]
     half = [1.0, *[0.5] * lags]
     seen = [half[h] * _inner(kept, [_both_sides(r, h, xp) for r in kept], xp) for h in range(lags + 1)]
     pairs = [half[h] * _inner(mask, [_both_sides(r, h, xp) for r in mask], xp) for h in range(lags + 1)]
-    within = [sum(xp.einsum("tci,tcj->ij", a, b) for a, b in zip(shifted[0], y, strict=True)) for y in shifted]
+    flat = basis.shape[1]
+    within = [
+        sum(a.reshape(-1, flat).T @ b.reshape(-1, flat) for a, b in zip(shifted[0], y, strict=True)) for y in shifted
+    ]
     rows = []
     for h in range(lags + 1):
         row = []
