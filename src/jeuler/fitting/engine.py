@@ -389,7 +389,7 @@ def report(
         autocorrelation=rho,
         correlated=found is not None and bool(np.any(found.covariance != found.white)),
         sigma_given=problem.absolute,
-        more=(*known.more, *_kept(layout)),
+        more=(*known.more, *_few(size, len(x)), *_kept(layout)),
     )
     return Fit(
         params=layout.params(jnp.asarray(x)),
@@ -410,6 +410,13 @@ def report(
         autocorrelation=rho,
         starts=starts,
     )
+
+
+def _few(count: int, unknowns: int) -> tuple[str, ...]:
+    """A word where hardly more is known than is asked."""
+    if unknowns < count < 2 * unknowns:
+        return (f"there are only {count} data for {unknowns} parameters: the errors are guesses; record more",)
+    return ()
 
 
 def _kept(layout: Layout) -> tuple[str, ...]:

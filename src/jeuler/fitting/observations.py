@@ -30,6 +30,8 @@ def checked_observations(times: Any, positions: Any, shape: tuple[int, ...], t0:
             f"times must lie in the simulated span, which begins at t0 = {t0} s, got {times[0]}; "
             f"pass t0, the time of the state, or drop the rows before it"
         )
+    if times[0] == times[-1]:
+        raise ValueError(f"times must hold at least two different times, got only {times[0]:g} s; record for longer")
     if checks.is_traced(targets):
         return times, targets
     if np.isinf(targets).any():

@@ -72,6 +72,7 @@ class Recorded:
             if checks.is_traced(value):
                 raise ValueError(f"{name} must be a value, got a traced one; only positions and parameters are traced")
         times, targets = checked_observations(times, positions, state.position.shape, float(t0))
+        _refuse_stillness(targets)
         needed = max(1, int(np.ceil((times[-1] - t0) / dt * (1 - 1e-12))))
         num_steps = needed if num_steps is None else checks.count("num_steps", num_steps, least=1)
         if num_steps < needed:
@@ -214,6 +215,16 @@ class Recorded:
             words = [*words, *more]
         fields["message"] = "; ".join([fields["message"], *words])
         return fields, bias, scene, state, predicted
+
+
+def _refuse_stillness(targets: Any) -> None:
+    """Positions that never change say nothing, unless they are the placeholder zeros of a question before the data."""
+    if checks.is_traced(targets):
+        return
+    seen = np.isfinite(targets)
+    first = np.where(seen, targets, 0)[np.argmax(seen, axis=0), *np.indices(seen.shape[1:])]
+    if seen.any() and np.any(first[seen.any(axis=0)]) and np.all(np.where(seen, targets, first) == first):
+        raise ValueError("positions must move, got the same ones at all times; give a recording of a motion")
 
 
 def _good(found: Fit) -> bool:
