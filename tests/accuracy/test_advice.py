@@ -165,6 +165,46 @@ def test_it_refuses_below_the_roundoff_floor_of_float32_and_names_what_could():
     assert abs(float(run.y[-1]) * math.e - 1) < 1.3e-6
 
 
+def driven(t, y, args):
+    """Switched on and off each second; y(20) from y(0) = 110 solved piece by piece."""
+    return jnp.where(jnp.floor(t) % 2 == 0, 55 - 1.5 * y, -0.5 * y)
+
+
+@pytest.mark.parametrize("step", [jeuler.heun_step, jeuler.rk4_step])
+@pytest.mark.parametrize("target", [1e-2, 1e-3, 1e-4])
+def test_no_answer_is_above_its_target_where_the_field_switches(step, target):
+    advice = advise_step(driven, 110.0, t1=20.0, error=target, step=step)
+    assert advice.feasible
+    run = jeuler.solve(driven, 110.0, dt=advice.dt, num_steps=advice.num_steps, step=step)
+    assert abs(float(run.y[-1]) / 19.981344941683865 - 1) <= 1.1 * target
+
+
+def test_growth_of_the_solution_itself_does_not_bind_symplectic_euler():
+    """A pendulum over the top; by runs of 2^17 RK4 steps its error is 1e-3 at about 6,500 steps."""
+    pendulum = lambda t, y, args: (y[1], -9.81 * jnp.sin(y[0]))  # noqa: E731
+    start = jnp.array([1.0]), jnp.array([6.0])
+    advice = advise_step(pendulum, start, t1=5.0, error=1e-3, step=jeuler.symplectic_euler_step)
+    assert 6_000 < advice.num_steps < 9_000
+
+
+@pytest.mark.parametrize(("step", "most"), [(jeuler.rk4_step, 4), (jeuler.extrapolated_euler(8), 2)])
+def test_few_steps_are_advised_where_few_do(step, most):
+    decay = lambda t, y, args: -y  # noqa: E731
+    advice = advise_step(decay, 1.0, t1=1.0, error=1e-3, step=step)
+    assert advice.num_steps <= most
+    run = jeuler.solve(decay, 1.0, dt=advice.dt, num_steps=advice.num_steps, step=step)
+    assert abs(float(run.y[-1]) * math.e - 1) < 1e-3
+
+
+def test_a_scene_and_its_state_are_advised_and_effects_left_out_are_named():
+    scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks=40.0, kd=0.5, rest_length=1.0),))
+    state = jeuler.ParticleState(jnp.array([[0.0], [1.5]]), jnp.zeros((2, 1)))
+    expected = advise_step(scene.vector_field, (state.position, state.velocity), args=1.0, t1=1.0, error=1e-2)
+    assert advise_step(scene, state, t1=1.0, error=1e-2) == expected
+    bounded = jeuler.Scene(scene.forces, (jeuler.Collisions((jeuler.Plane([0.0], [1.0]),)),))
+    assert "without Collisions" in advise_step(bounded, state, t1=1.0, error=1e-2).reason
+
+
 def test_it_refuses_what_it_cannot_look_into():
     f, y0, t0, t1, _ = published("MAZZIA_ROBER")
     advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2)

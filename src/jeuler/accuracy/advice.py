@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -15,6 +16,8 @@ from jeuler._core.precision import flat
 from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
 from jeuler.accuracy.search import AIM, FACTOR, Search
+from jeuler.particles.fields import name_of
+from jeuler.particles.scene import Scene
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -56,7 +59,7 @@ class StepAdvice:
 
 @says_what_to_write(dt="nothing: it finds dt", num_steps="nothing: it finds it", tolerance="error=...")
 def advise_step(
-    f: VectorField,
+    f: VectorField | Any,
     y0: PyTree,
     *,
     t1: float,
@@ -85,7 +88,8 @@ def advise_step(
     steps are counted on than the integer clock can count, 2^31 - 1.
 
     Args:
-      f: vector field, ``f(t, y, args) -> dy/dt``.
+      f: vector field, ``f(t, y, args) -> dy/dt``; or a `Scene`, and then y0 is its `ParticleState`: the advice is for
+        its forces, and the reason names the effects that it leaves out.
       y0: initial state; its dtype is the precision advised for.
       t1: final time, s.
       error: target at t1, > 0.
@@ -101,11 +105,16 @@ def advise_step(
       >>> import jeuler
       >>> advice = jeuler.advise_step(lambda t, y, args: -y, 1.0, t1=1.0, error=1e-3)
       >>> advice.feasible, advice.num_steps
-      (True, 628)
+      (True, 626)
 
     Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P. Henrici, Discrete
       Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
+    left_out = ""
+    if isinstance(f, Scene):
+        effects = [name_of(effect) for effect in f.effects if not hasattr(effect, "constrain")]
+        left_out = f"; without {', '.join(effects)}, which pilot runs leave out" if effects else ""
+        (y0, args), f = f.as_equation(y0), f.vector_field
     y0 = checks.state("y0", y0)
     checks.untraced("advise_step", y0, args, t0, t1, error)
     t0, t1 = checks.interval(t0, t1)
@@ -131,7 +140,8 @@ def advise_step(
         compensated=compensated,
         most=max_pilot_steps,
     )
-    return _Words(search).advice()
+    advice = _Words(search).advice()
+    return dataclasses.replace(advice, reason=advice.reason + left_out)
 
 
 class _Words:
@@ -152,8 +162,16 @@ class _Words:
         if 2 * start > search.most:
             return self.refusal(f"{self.needs()}, more than pilot runs of {search.most:,} can look into")
         ladder = search.climb(start)
-        if ladder is not None:
+        if ladder is not None and search.even(ladder):
             return self.answer(ladder)
+        final = search.reference()
+        if final is not None and (found := search.uneven(final)) is not None:
+            return self.uneven(final, *found)
+        if ladder is not None:
+            return self.refusal(
+                f"the error of {self.name} does not fall evenly with dt (f may jump), and no run of at most "
+                f"{search.most:,} steps was seen to meet the target; use an adaptive solver, or raise max_pilot_steps"
+            )
         if search.bound * search.most < 16 * search.interval:
             return self.refusal(f"{self.needs()}; pilot runs of {search.most:,} cannot tell its error")
         return self.refusal(
@@ -189,6 +207,19 @@ class _Words:
             if num_steps > 10_000_000 and search.order == 1:
                 how += "; heun_step or rk4_step would need far fewer"
         reason = f"{num_steps:,} steps: {how}"
+        return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
+
+    def uneven(self, final: Any, num_steps: int, error: float) -> StepAdvice:
+        """An answer where errors do not follow the order: that of a run of the advised step itself."""
+        search = self.search
+        rounding = search.rounding(Ladder(search.order, [num_steps], [search.pilot(num_steps)[-1]], final, 0.0))
+        total = error / search.scale(final) + rounding.after(num_steps)
+        if total > search.error:
+            return self.refusal(f"roundoff in {search.dtype} leaves no error below {total:.1e}", total)
+        reason = (
+            f"{num_steps:,} steps: confirmed by a pilot run of that dt against an adaptive run; the error does not "
+            "fall evenly with dt, as where f jumps"
+        )
         return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
 
     def bound_by_stability(self, ladder: Ladder, num_steps: int, better: float) -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 import numpy as np
 
 from jeuler._core import trees
-from jeuler._core.precision import double_precision, flat
+from jeuler._core.precision import cast, double_precision, flat, flat_rows
 from jeuler.accuracy.pilot import Ladder, Pilot, distance
 from jeuler.accuracy.roundoff import Rounding
+from jeuler.solving._adaptive import solve_adaptive
 from jeuler.steps.explicit import Step, VectorField
 from jeuler.steps.implicit import linearly_implicit_euler_step
 from jeuler.steps.stability import Linearisation
@@ -24,6 +26,13 @@ MARGIN = 0.01  # by which dt may be larger with the error still near the target
 FINENESS = 1e-3  # part of the number of steps below which the search makes no difference
 TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
 REGULAR = 0.25  # and the observed order be this close to the step's own, to predict beyond the pilots
+OFF = 0.93, 0.79, 0.61  # parts of the finest rung: numbers of steps that share no pattern with it
+EVEN = 2.5  # times the error that the order of the step tells of them
+BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
+FINER = 1.1  # from one number of steps to the next where errors are uneven
+REFERENCE_RTOL = 1e-8, 1e-11  # of adaptive runs; the second is the reference
+REFERENCE_STEPS = 65_536
+NEAR_ENOUGH = 4  # an answer of up to this part of the longest pilot run is run itself, not predicted
 ROUGH = 2**18  # steps of the longest run in float32
 
 
@@ -106,7 +115,8 @@ class Search:
                     looked = True
                     times = self.t0 + self.interval * np.arange(1, len(states) + 1) / len(states)
                     self.look_at_stability(states[::2], times[::2])
-                if ladder.errors()[-1] <= self.target(ladder) or self._regular(ladder):
+                far = self._regular(ladder) and self.predicted(ladder)[0] > self.most // NEAR_ENOUGH
+                if ladder.errors()[-1] <= self.target(ladder) or far:
                     return ladder
             num_steps *= 2
         return None
@@ -157,6 +167,8 @@ class Search:
             rung -= 1
         high, error_high = ladder.num_steps[rung], float(errors[rung])
         low, error_low = (ladder.num_steps[rung - 1], float(errors[rung - 1])) if rung else (high // 2, math.inf)
+        while not rung and high > 1 and (error := error_of(high // 2)) <= aim:  # fewer than the ladder begins with
+            high, error_high, low = high // 2, error, high // 4
         if not firm(high):
             low, error_low = high, math.inf
             high *= 2
@@ -173,6 +185,69 @@ class Search:
             else:
                 low, error_low = middle, error if error > aim else math.inf
         return high, error_high
+
+    def even(self, ladder: Ladder) -> bool:
+        """Whether an adaptive run ends where the ladder does, and runs off the ladder have the errors that it tells.
+
+        Where f jumps, rungs that are powers of two may all meet the jumps alike, and agree on a wrong state.
+        """
+        finest, error = ladder.num_steps[-1], float(ladder.errors()[-1])
+        final, known = self.reference(), 2 * TRUST * max(self.target(ladder), error)
+        if final is not None and ladder.error_of(final) > known:
+            return False
+        floor = 1e-12 * float(np.linalg.norm(ladder.finals[-1])) + 2 * ladder.doubt
+        for part in OFF:
+            num_steps = round(part * finest)
+            expected = error * (finest / num_steps) ** self.order
+            if ladder.error_of(self.pilot(num_steps)[-1]) > EVEN * expected + floor:
+                return False
+        return True
+
+    @functools.cached_property
+    def adaptive_finals(self) -> list[np.ndarray]:
+        """The states at t1 of adaptive runs at two tolerances; NaN where they take too many steps."""
+        finals = []
+        max_steps = min(REFERENCE_STEPS, max(256, self.most // 8))
+        with double_precision():
+            for rtol in REFERENCE_RTOL:
+                y0, args = cast(self.start, np.float64), cast(self.args, np.float64)
+                size = max(float(np.linalg.norm(flat(y0))), 1e-3)
+                run = solve_adaptive(
+                    self.f,
+                    y0,
+                    t0=self.t0,
+                    t1=self.t1,
+                    args=args,
+                    rtol=rtol,
+                    atol=rtol * size,
+                    max_steps=max_steps,
+                )
+                finals.append(flat_rows(run.y)[-1])
+        return finals
+
+    def reference(self) -> np.ndarray | None:
+        """The state at t1 by an adaptive run, if two tolerances agree on it well enough to judge the target."""
+        loose, tight = self.adaptive_finals
+        known = distance(loose, tight) <= TRUST * self.error * self.scale(tight)
+        return tight if np.all(np.isfinite(tight)) and known else None
+
+    def uneven(self, final: np.ndarray) -> tuple[int, float] | None:
+        """The fewest steps of a fine scan whose own run meets the aim, with runs beside it near the target."""
+        target = self.error * self.scale(final)
+        aim, num_steps, spent = AIM * target, 1, 0
+
+        def error_of(num_steps: int) -> float:
+            error = distance(self.pilot(num_steps)[-1], final)
+            return error if math.isfinite(error) else math.inf
+
+        while num_steps <= self.most and spent <= 2 * self.most:
+            spent += num_steps
+            error = error_of(num_steps)
+            beside = [round(num_steps * part) for part in BESIDE]
+            if error <= aim and all(error_of(max(n, 1)) <= FACTOR * target for n in beside):
+                return num_steps, error
+            num_steps = max(num_steps + 1, round(FINER * num_steps))
+        return None
 
     def implicit_steps(self, ladder: Ladder, fewer_than: int) -> int | None:
         """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that few."""
