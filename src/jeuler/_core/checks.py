@@ -137,11 +137,16 @@ def increasing(name: str, times: Any) -> None:
         )
 
 
+def _places(mask: Any) -> Any:
+    """The indices at which a mask is set; quick where there is none, for these checks are made at every call."""
+    return np.argwhere(mask) if mask.any() else ()
+
+
 def not_negative(name: str, x: Any, unit: str) -> None:
     """No number in the array x is below zero. A traced x is passed over, as is NaN, which `diagnose` finds."""
     if is_traced(x):
         return
-    below = np.argwhere(np.asarray(x) < 0)
+    below = _places(np.asarray(x) < 0)
     if len(below):
         where = f" at index {', '.join(map(str, below[0]))}" if np.ndim(x) else ""
         raise ValueError(
@@ -154,7 +159,7 @@ def above_zero(name: str, x: Any, unit: str) -> None:
     """Every number in the array x is above zero. A traced x is passed over, as is NaN."""
     if is_traced(x):
         return
-    below = np.argwhere(np.asarray(x) <= 0)
+    below = _places(np.asarray(x) <= 0)
     if len(below):
         where = f" at index {', '.join(map(str, below[0]))}" if np.ndim(x) else ""
         raise ValueError(f"{name} must be greater than 0{unit and ' ' + unit}, got {_at(x, below[0])}{where}")
@@ -166,7 +171,7 @@ def finite(name: str, x: Any, *, infinite: bool = False) -> None:
         return
     values = np.asarray(x)
     values = values.astype(np.float32) if values.dtype.kind not in "fc" else values
-    wrong = np.argwhere(np.isnan(values) if infinite else ~np.isfinite(values))
+    wrong = _places(np.isnan(values) if infinite else ~np.isfinite(values))
     if len(wrong):
         where = f" at index {', '.join(map(str, wrong[0]))}" if np.ndim(x) else ""
         expected = "a number" if infinite else "finite"

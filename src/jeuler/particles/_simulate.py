@@ -90,8 +90,6 @@ def simulate(
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
     grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint)
-    check_step(step)
-    check_save(save)
     checks.true_or_false("compensated", compensated)
     check_parameters("scene", scene)
     inputs = scene, state, grid, key, Function(step), Function(save)
@@ -117,6 +115,7 @@ def _simulate(
 ) -> Solution:
     """`simulate`, as it is compiled."""
     step, save = stepper.function, saver.function
+    check_save(save)
     scene_step, state = first_step(scene, state, grid, step, key, compensated=compensated, any_window=bool(windows))
 
     def saved(t, parts):

@@ -133,8 +133,6 @@ def solve(
     y0 = checks.state("y0", y0)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0))
     checks.field_form(f)
-    check_step(step)
-    check_save(save)
     checks.true_or_false("compensated", compensated)
     f, args = arrays_only(f, args)
     breaks = checked_breaks(breaks, grid.dt.dtype)
@@ -160,6 +158,8 @@ def _solve(
 ) -> Solution:
     """`solve`, as it is compiled."""
     f, step, save = field.function, stepper.function, saver.function
+    check_step(step)
+    check_save(save)
     checks.vector_field(f, grid.t0, y0, args)
     if checkpoint == "reversible":
         return solve_reversibly(f, y0, args, grid, save, step, compensated)
