@@ -305,8 +305,8 @@ def test_errors_are_the_same_at_every_call():
             jeuler.simulate(scene(-1.0), STATE, **GRID)
         with pytest.raises(ValueError, match="keep the shape of y"):
             end(lambda t, y, args: y[:1], jnp.ones(2))
-        with pytest.raises(ValueError, match="dt must be greater than 0"):
-            end(lambda t, y, args: y, dt=-1.0)
+        with pytest.raises(ValueError, match="dt must"):
+            end(lambda t, y, args: y, dt=0.0)
 
 
 # Memory

@@ -86,7 +86,10 @@ def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
         return _traced_again(function, settings, leaves, structure)
     try:
         return program(leaves, dynamic, arrays)
-    except NEEDS_VALUES:  # an array of a closure is used as a number while tracing, as in float(x)
+    except (ValueError, *NEEDS_VALUES) as error:
+        if not _needs_values(error):
+            raise
+        # an array of a closure is used as a number while tracing, as in float(x)
         program.needs_values = True
         return _traced_again(function, settings, leaves, structure)
 
@@ -127,11 +130,18 @@ def _traced_again(function: Callable, settings: tuple, leaves: list, structure: 
         return run(dynamic)
     try:
         lowered = jax.jit(run).lower(dynamic)
-    except NEEDS_VALUES:
+    except (ValueError, *NEEDS_VALUES) as error:
+        if not _needs_values(error):
+            raise
         return run(dynamic)
     key = hashlib.sha256(lowered.as_text().encode()).digest(), lowered.in_tree, lowered.out_tree, _devices(dynamic)
     compiled = by_text.get(key) or by_text.put(key, lowered.compile())
     return compiled(dynamic)
+
+
+def _needs_values(error: BaseException | None) -> bool:
+    """Whether this error, or what it was raised from, is that something traced was asked for its value."""
+    return error is not None and (isinstance(error, NEEDS_VALUES) or _needs_values(error.__cause__))
 
 
 def _tokens(leaves: list) -> tuple[list, list, tuple]:
