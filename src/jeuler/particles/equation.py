@@ -140,9 +140,11 @@ class Equation:
         if not drags:
             return add([share.force for share in shares], x), attributes.mass
         others = add([share.force for share in shares if share.drag is None], x)
-        if any(drag.quadratic is not None for drag in drags):  # of which each component needs the others of all
+        quadratic = any(drag.quadratic is not None for drag in drags)
+        if quadratic:  # each component needs the forces on all: without this, XLA works these out again for each
             others = [stored(component) for component in others]
         mass = inertia(attributes.mass, jnp.asarray(self.context.dt), drags, v, others)
+        mass = stored(mass) if quadratic else mass
         return add([others, *(share.force for share in shares if share.drag is not None)], x), mass
 
 
