@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jeuler
-from jeuler.accuracy import Compensated, work_precision
+from jeuler.accuracy import Compensated, WorkPrecision, work_precision
 from jeuler.accuracy.table import EMPTY_ROW, fitted_order, mark_pareto, roundoff_floor
 from jeuler.steps.extrapolated import extrapolated_euler
 from jeuler.steps.implicit import linearly_implicit_euler_step
@@ -259,3 +259,17 @@ def test_traced_values_are_told():
 def test_x64_is_left_as_it_was(table):
     assert jax.config.jax_enable_x64
     assert jnp.ones(1).dtype == jnp.float64
+
+
+def test_errors_below_that_of_the_reference_count_for_nothing():
+    def row(dt, error, seconds):
+        return EMPTY_ROW | {
+            "method": "a", "dtype": "float64", "dt": dt, "num_steps": round(1 / dt), "error_final": error,
+            "error_final_relative": error, "run_seconds_min": seconds,
+        }  # fmt: skip
+
+    rows = [row(0.1, 1e-2, 1.0), row(0.05, 5e-3, 2.0), row(0.025, 2.5e-3, 3.0), row(0.0125, 1e-9, 4.0)]
+    mark_pareto(rows, 1e-6)
+    assert [r["pareto"] for r in rows] == [True, True, True, False]
+    table = WorkPrecision(rows, {}, 1e-6, (0.0, 1.0))
+    assert table.summary[0].order == pytest.approx(1.0)

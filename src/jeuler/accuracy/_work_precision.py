@@ -148,7 +148,7 @@ def work_precision(
                             pace = row["run_seconds_min"] / run.num_steps
                         rows.append(row)
                         bar.update()
-    mark_pareto(rows)
+    mark_pareto(rows, truth.error)
     return WorkPrecision(rows=rows, stability_limits=limits, reference_error=truth.error, interval=(t0, t1))
 
 

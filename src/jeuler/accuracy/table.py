@@ -106,7 +106,8 @@ class WorkPrecision:
         """Order, floor and stability limit of each method in each precision."""
         found = []
         for method, dtype, rows in self.series():
-            rows = [row for row in rows if math.isfinite(row["error_final"]) and row["error_final"] > 0]
+            least = self.reference_error
+            rows = [row for row in rows if math.isfinite(row["error_final"]) and row["error_final"] > least]
             dt = np.array([row["dt"] for row in rows])
             error = np.array([row["error_final"] for row in rows])
             relative = np.array([row["error_final_relative"] for row in rows])
@@ -177,12 +178,16 @@ def _count(n: int) -> str:
     return f"{n:,}" if n >= 0 else "-"
 
 
-def mark_pareto(rows: list[dict[str, Any]]) -> None:
-    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no result."""
+def mark_pareto(rows: list[dict[str, Any]], reference_error: float = 0.0) -> None:
+    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no result.
+
+    Nor is one below that of the reference.
+    """
     for row in rows:
         row["pareto"] = False
     best = math.inf
-    able = [row for row in rows if math.isfinite(row["error_final"]) and not row["error_final_relative"] > 1]
+    known = [row for row in rows if math.isfinite(row["error_final"]) and row["error_final"] >= reference_error]
+    able = [row for row in known if not row["error_final_relative"] > 1]
     for row in sorted(able, key=lambda row: (row["run_seconds_min"], row["error_final"])):
         if row["error_final"] < best:
             row["pareto"], best = True, row["error_final"]

@@ -43,7 +43,7 @@ class ExtrapolatedStep:
 
     def increment(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
         """y(t + dt) - y, what ``solve(compensated=True)`` adds."""
-        return self.increment_with_error(f, t, y, dt, args)[0]
+        return jax.tree.map(lambda row: aitken_neville(row)[0], self.rows(f, t, y, dt, args)[0])
 
     def increment_with_error(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
         """The increment, and its estimated error: T_kk - T_{k,k-1}, or the `jump` of an explicit base if larger."""
