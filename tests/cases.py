@@ -149,8 +149,8 @@ EFFECTS = {
     "sampled_motion": effect(
         lambda: jeuler.PrescribedMotion([0], jeuler.SampledPath([0.0, 0.5, 1.0, 1.5], SAMPLES))
     ),
-    "collisions": effect(lambda: jeuler.Collisions(SOLIDS, radius=0.05, restitution=0.5, friction=0.3)),
-    "colliding_pairs": effect(lambda: jeuler.Collisions(pairs=[(1, 2)], radius=0.2, restitution=0.5)),
+    "collisions": effect(lambda: jeuler.Collisions(SOLIDS, radius=0.05, restitution=0.5, friction=0.3), "unresolved_contacts"),
+    "colliding_pairs": effect(lambda: jeuler.Collisions(pairs=[(1, 2)], radius=0.2, restitution=0.5), "unresolved_contacts"),
     "speed_limit": effect(lambda: jeuler.SpeedLimit(0.5)),
     "emitter": effect(lambda: jeuler.Emitter(40.0, PLACE, SPEED, max_births=2), *POOL),
     "emitter_of_a_disc": effect(

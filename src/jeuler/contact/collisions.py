@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jeuler._core import checks
 from jeuler._core.annotations import ColliderLike, Parameter, default
 from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import component, store_as_float
 from jeuler.contact.colliders import as_collider, check_collider
-from jeuler.contact.impacts import Impacts, Path
+from jeuler.contact.contacts import Contacts
+from jeuler.contact.within_step import resolve
 
 
 @component(static=("pairs", "max_bounces"), positive=("radius", "restitution", "friction"))
@@ -23,10 +23,13 @@ class Collisions:
 
         at gap = 0:   v_n -> -restitution v_n,   |change of v_t| <= friction |change of v_n|
 
-    The rest of the step is travelled with the new velocity, so that values and gradients through a bounce are those of
-    the exact motion for free flight, and a thin obstacle is not missed within a step. What still touches at the end of
-    the step rests: it is put on the surface, without bounce, with friction. Particles do not collide with each other
-    unless ``pairs`` names them. A pinned particle (mass = inf) is never moved.
+    Impacts are found at their time within the step and followed one after the other, as many as there are; the rest of
+    the step is travelled with the new velocity, so that values and gradients through a bounce are those of the exact
+    motion, and a thin obstacle is not missed. What touches at the start of a step and does not come together faster
+    than the forces of one step can make it rests: contact forces hold it through the step, stacks and piles too.
+    Overlaps of what rests are closed by displacements. What could not be resolved is counted in
+    ``Solution.unresolved_contacts``. Particles do not collide with each other unless ``pairs`` names them. Pinned
+    particles (mass = inf) and prescribed ones are never moved. Where a signed distance is NaN, so is the particle.
 
     Args:
       colliders: `Plane`, `Sphere`, `Box`, or any signed distance ``(t, point) -> ()``; a tuple.
@@ -34,7 +37,8 @@ class Collisions:
       radius: of each particle, () or (particle,), m. Differentiable.
       restitution: 1 elastic, 0 no bounce, (). Differentiable.
       friction: Coulomb's coefficient, (). Differentiable.
-      max_bounces: impacts of one particle that are followed within one step; the next one rests. Static.
+      max_bounces: rounds of impacts that are followed within one step, those that come at once in different places in
+        one; None: 8, with pairs 32. What is left is counted. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state at the end of the step. Without
       ``previous``, the state before the step is taken to be the one from which this velocity leads to this position.
     Raises: ValueError, if a value is out of its range; in `simulate`, if an index or a shape does not fit.
@@ -47,7 +51,8 @@ class Collisions:
       [0.32, 1.2]
 
     Source: B. Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems, 1996, ch. 3; gradients: Y. Hu et al.,
-      DiffTaichi, ICLR 2020, sect. 4 (time of impact).
+      DiffTaichi, ICLR 2020, sect. 4 (time of impact); rest: M. Anitescu, F. A. Potra, Formulating Dynamic Multi-Rigid-
+      Body Contact Problems with Friction as Solvable Linear Complementarity Problems, Nonlinear Dynamics 14, 1997.
     """
 
     colliders: tuple[ColliderLike, ...] = ()
@@ -55,7 +60,8 @@ class Collisions:
     radius: Parameter = default(0.0)
     restitution: Parameter = default(0.0)
     friction: Parameter = default(0.0)
-    max_bounces: int = 3
+    max_bounces: int | None = None
+    gives_way: ClassVar[bool] = True  # to prescribed particles: `simulate` calls it with mass inf for these
 
     forward_only = True
 
@@ -67,7 +73,8 @@ class Collisions:
         colliders = tuple(as_collider(f"Collisions.colliders[{k}]", c) for k, c in enumerate(self.colliders))
         object.__setattr__(self, "colliders", colliders)
         object.__setattr__(self, "pairs", _pairs(self.pairs))
-        checks.count("Collisions.max_bounces", self.max_bounces, least=1)
+        if self.max_bounces is not None:
+            checks.count("Collisions.max_bounces", self.max_bounces, least=1)
         store_as_float(self, "radius", "restitution", "friction")
         for name, most in (("radius", np.inf), ("restitution", 1.0), ("friction", np.inf)):
             value = getattr(self, name)
@@ -79,12 +86,20 @@ class Collisions:
         if previous is None:
             previous = dataclasses.replace(state, position=state.position - dt * state.velocity)
         x, v = previous.position, previous.velocity
-        step = Impacts(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
-        zero = jnp.zeros(len(x), x.dtype)
-        path = Path(zero, x, state.position - x, state.velocity - v, jnp.zeros_like(v), step.inverse_mass > 0)
-        path, _ = lax.scan(lambda path, _: (step.next_impact(path), None), path, length=self.max_bounces)
-        position, velocity = step.rest(path, state.velocity + path.jump)
-        return dataclasses.replace(state, position=position, velocity=velocity)
+        contacts = Contacts(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
+        position, velocity, unresolved = resolve(contacts, x, v, state.position, state.velocity, self._rounds())
+        before = state.unresolved_contacts
+        count = before if before is None else before + unresolved
+        return dataclasses.replace(state, position=position, velocity=velocity, unresolved_contacts=count)
+
+    @property
+    def writes(self) -> tuple[str, ...]:
+        return ("unresolved_contacts",)
+
+    def _rounds(self) -> int:
+        if self.max_bounces is not None:
+            return self.max_bounces
+        return 32 if self.pairs else 8
 
     def check(self, particles: int, dim: int) -> None:
         for i, j in self.pairs:

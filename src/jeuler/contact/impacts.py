@@ -1,4 +1,8 @@
-"""Impacts: when on its way through a step a particle meets a collider or another ball, and what it does to it."""
+"""Impacts: when on its way through a step a particle meets a collider or another ball, and what it does to it.
+
+The search for the impacts is not differentiated. It writes a schedule: who meets what in which round. The rounds are
+then gone through again, with the time of each impact as a function of the paths.
+"""
 
 from __future__ import annotations
 
@@ -6,228 +10,216 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
-from jeuler._core.vectors import length, unit
-from jeuler._jax.root import root
-from jeuler.contact.colliders import Collider, normal_and_speed
+from jeuler._core.vectors import length
+from jeuler.contact.contacts import Contacts
+from jeuler.contact.paths import Path
 
 MAX_STRIDES = 100  # along one path; a path that grazes a surface needs many
 NEWTON_STEPS = 5
+REFINEMENTS = 2  # of Newton's method from the root: derivatives of the root are right up to the third
 
 
-class Path(NamedTuple):
-    """The way of each particle through one step, in parts s from 0 to 1 of it; straight between impacts.
+class Events(NamedTuple):
+    """The next impact of each particle, or of each of several rounds."""
 
-        x(s) = x + (s - s_x) (drift + dt jump),   v(s) = drift/dt + (s - 1/2) dv + jump
+    contact: Array  # (particle,), its number, -1 for none
+    s: Array  # (particle,)
+    at_root: Array  # (particle,), whether the gap is 0 there; in an overlap it is not
+    plastic: Array  # (particle,), whether it stays: too slow an approach for restitution
 
-    The displacement of a step holds the velocity at its middle, whichever Euler step made it; counted from there, the
-    energy of an elastic bounce is kept to second order.
+
+class Found(NamedTuple):
+    """The next impact of each contact, if it were alone."""
+
+    s: Array  # (contact,), inf for none
+    at_root: Array
+    plastic: Array
+
+
+def bounce(v: Array, normal: Array, restitution: Any, friction: Any) -> Array:
+    """The change of the relative velocity by an impact: Newton's restitution and Coulomb's friction.
+
+    v_n -> -restitution v_n,   |change of v_t| <= friction |change of v_n|,   against v_t
     """
-
-    s: Array  # (particle,), when the last impact was
-    x: Array  # (particle, dim), where
-    drift: Array  # (particle, dim), the step's own displacement
-    dv: Array  # (particle, dim), what forces added to the velocity
-    jump: Array  # (particle, dim), what impacts added to it
-    flying: Array  # (particle,), whether something may be in the way
-
-    def displacement(self, dt: Any) -> Array:
-        return self.drift + dt * self.jump
-
-    def velocity(self, s: Array, dt: Any) -> Array:
-        return self.drift / dt + (s[:, None] - 0.5) * self.dv + self.jump
+    v_n = jnp.sum(v * normal, axis=-1)
+    push = -(1 + restitution) * jnp.where(v_n < 0, v_n, 0)
+    v_t = v - v_n[..., None] * normal
+    speed = length(v_t)
+    held = friction * push > speed  # strictly: friction 0 holds nothing
+    lost = jnp.where(held, 1, friction * push / jnp.where(held | (speed == 0), 1, speed))
+    return push[..., None] * normal - lost[..., None] * v_t
 
 
-class Impacts:
-    """The impacts of one step of length dt from t0, for one `Collisions`."""
+def impulsive_limit(contacts: Contacts, normal: Array, path: Path) -> Array:
+    """The speed of approach, m a step, up to which an impact is one that the step itself can make: it is plastic."""
+    eps = jnp.finfo(path.x.dtype).eps
+    bend = contacts.relative(path.bend)
+    made = jnp.abs(jnp.sum(bend * normal, axis=-1))
+    rounding = contacts.both(jnp.add, 4 * eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1)))
+    return 1.001 * made + rounding
 
-    t0: Array
-    dt: Array
-    colliders: tuple[Collider, ...]
-    restitution: Array
-    friction: Array
-    radius: Array
-    inverse_mass: Array
-    i: np.ndarray
-    j: np.ndarray
-    both_alive: Any
 
-    def __init__(self, contact: Any, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None) -> None:
-        self.t0, self.dt = t0.astype(x.dtype), dt.astype(x.dtype)
-        self.colliders = contact.colliders
-        self.restitution = contact.restitution.astype(x.dtype)
-        self.friction = contact.friction.astype(x.dtype)
-        self.radius = jnp.broadcast_to(contact.radius.astype(x.dtype), len(x))
-        mass = mass if alive is None else jnp.where(alive, mass, jnp.inf)  # whatever the mass of a dead slot is
-        self.inverse_mass = jnp.broadcast_to(1 / mass.astype(x.dtype), len(x))
-        self.i, self.j = np.array(contact.pairs, np.int32).reshape(-1, 2).T
-        self.both_alive = True if alive is None else alive[self.i] & alive[self.j]
+def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
+    """The next impact of each contact along the paths as they are now.
 
-    def gap(self, collider: Collider, s: Array, x: Array) -> Array:
-        """The distance between the surfaces of collider and particles, (particle,), m."""
-        return jax.vmap(collider)(self.t0 + s * self.dt, x) - self.radius
+    Strides of the length of the gap, which cannot cross a surface (J. C. Hart, Sphere tracing, 1996), up to near it;
+    then Newton's method. Who touches and approaches is at an impact now; its root is close by, or in the past.
+    """
+    start = contacts.both(jnp.maximum, path.s)
+    small = contacts.roundoff(path.x)
+    first = contacts.look(path, start)
+    limit = impulsive_limit(contacts, first.normal, path) + slow
+    touching = first.gap <= small
+    now = touching & (-first.slope > limit)
+    lowest = jnp.where(now, start - 1, start)
+    fastest = length(first.speed) + length(contacts.relative(path.bend))
+    stride = fastest + jnp.abs(first.recession) * contacts.dt
+    safe_stride = jnp.where(stride > 0, stride, 1)
+    searched = contacts.possible() & (now | (first.gap <= stride))
 
-    def roundoff(self, x: Array) -> Array:
-        """What a gap of zero may look like, (particle,), m."""
-        return 16 * jnp.finfo(x.dtype).eps * (jnp.max(jnp.abs(x), axis=-1) + self.radius)
+    def go_on(state):
+        s, _, _, _, newtons, n = state
+        return jnp.any(searched & (newtons < NEWTON_STEPS) & (s <= 1)) & (n < MAX_STRIDES)
 
-    def next_impact(self, path: Path) -> Path:
-        """The path after the next impact of each particle, where there is one."""
-        wall_times = [self.time_of_impact(collider, path) for collider in self.colliders]
-        ball_times = self.time_of_meeting(path) if len(self.i) else jnp.zeros(0)
-        first = jnp.full(path.s.shape, jnp.inf, path.s.dtype)
-        for times in wall_times:
-            first = jnp.minimum(first, times)
-        if len(self.i):
-            first = first.at[self.i].min(ball_times).at[self.j].min(ball_times)
+    def advance(state):
+        s, gap, slope, apart, newtons, n = state
+        far = apart & ((gap > 1e-3 * stride) | (slope >= 0)) & (gap > 0) & (newtons == 0)
+        ahead = jnp.maximum(gap / safe_stride, jnp.where(slope >= 0, 0.02, 0))  # away from it not too slowly
+        falls = slope < 0
+        root = jnp.clip(s - gap / jnp.where(falls, slope, -1), lowest, 2)
+        s = jnp.where(n == 0, s, jnp.where(far, s + ahead, jnp.where(falls, root, s)))
+        newtons = newtons + jnp.where((n > 0) & ~far, 1, 0)
+        look = contacts.look(path, s)
+        apart = jnp.where(n == 0, ~now & (look.gap > small), apart)
+        return s, look.gap, look.slope, apart, jnp.where(now | apart, newtons, NEWTON_STEPS), n + 1
 
-        s = jnp.where(jnp.isfinite(first), first, path.s)
-        x = path.x + (s - path.s)[:, None] * path.displacement(self.dt)
-        v, change = path.velocity(s, self.dt), jnp.zeros_like(path.dv)
-        done = jnp.zeros(len(s), bool)
-        for collider, times in zip(self.colliders, wall_times, strict=True):
-            now = jnp.isfinite(times) & (times == first) & ~done
-            normal, recession = jax.vmap(normal_and_speed, (None, 0, 0))(collider, self.t0 + s * self.dt, x)
-            bounce, _ = self.bounce(v, normal, recession, self.restitution)
-            change = change + jnp.where(now[:, None], bounce, 0)
-            done = done | now
-        if len(self.i):
-            now = self.first_of_their_balls(jnp.isfinite(ball_times), ball_times, first, done)
-            change = change + self.exchange(now, x, v, self.restitution)
-            done = done.at[self.i].max(now).at[self.j].max(now)
-        return path._replace(
-            s=jnp.where(done, s, path.s),
-            x=jnp.where(done[:, None], x, path.x),
-            jump=path.jump + change,
-            flying=jnp.isfinite(first),  # who met nothing flies on as before, and need not be searched again
-        )
+    begin = start + jnp.where(touching & ~now, 1e-3, 0)  # who leaves may come back
+    state = begin, first.gap, first.slope, now, jnp.zeros(contacts.count, jnp.int32), 0
+    s, gap, slope, apart, *_ = lax.while_loop(go_on, advance, state)
+    at_root = (slope < 0) & (jnp.abs(gap) <= small + 1e-6 * stride) & (s > lowest)
+    happens = searched & (now | (apart & at_root & (s <= 1)))
+    s = jnp.where(now & ~at_root, start, s)
+    return Found(jnp.where(happens, s, jnp.inf), at_root, ~now & (-slope <= limit))
 
-    def time_of_impact(self, collider: Collider, path: Path) -> Array:
-        """When each particle meets the collider next, a part of the step, inf where it does not; (particle,)."""
-        way = path.displacement(self.dt)
 
-        def gap(s):
-            return self.gap(collider, s, path.x + (s - path.s)[:, None] * way)
+def choose(contacts: Contacts, found: Found) -> Events:
+    """Who meets what in this round: the impacts that come first among all those of their particles and neighbours."""
+    n, numbers = contacts.particles, jnp.arange(contacts.count)
+    i, j, pairs = contacts.i, contacts.j, slice(contacts.walls, None)
 
-        def slope(s):
-            return jax.jvp(gap, (s,), (jnp.ones_like(s),))
+    def least(per_contact, initial):
+        value = jnp.min(per_contact[: contacts.walls].reshape(-1, n), axis=0, initial=initial)
+        return value.at[i].min(per_contact[pairs]).at[j].min(per_contact[pairs]) if len(i) else value
 
-        def search(gap, start):
-            """Strides of the length of the gap, which cannot cross a surface, then Newton's method."""
-            _, recession = jax.vmap(normal_and_speed, (None, 0, 0))(collider, self.t0 + start * self.dt, path.x)
-            stride = length(way) + jnp.abs(recession) * self.dt
-            safe_stride = jnp.where(stride > 0, stride, 1)
+    first = least(found.s, jnp.inf)
+    if len(i):
+        between = jnp.where(contacts.listed, jnp.minimum(first[i], first[j]), jnp.inf)
+        first = first.at[i].min(between).at[j].min(between)
+    now = jnp.isfinite(found.s) & (found.s <= contacts.both(jnp.minimum, first))
+    rank = jnp.where(now, numbers, contacts.count)
+    winner = least(rank, contacts.count)
+    chosen = jnp.where(winner < contacts.walls, winner, contacts.count)
+    if len(i):  # a pair goes on only if it is the first of both
+        agreed = now[pairs] & (winner[i] == rank[pairs]) & (winner[j] == rank[pairs])
+        number = jnp.where(agreed, rank[pairs], contacts.count)
+        chosen = chosen.at[i].min(number).at[j].min(number)
+    there = chosen < contacts.count
+    of = jnp.where(there, chosen, 0)
+    contact = jnp.where(there, chosen, -1).astype(jnp.int32)
+    return Events(contact, jnp.where(there, found.s[of], 0), there & found.at_root[of], there & found.plastic[of])
 
-            def far(state):
-                s, distance, n = state
-                return path.flying & (distance > 1e-3 * stride) & (s <= 1) & (n < MAX_STRIDES)
 
-            def advance(state):
-                s, distance, n = state
-                s = jnp.where(far(state), s + distance / safe_stride, s)
-                return s, gap(s), n + 1
+def apply(contacts: Contacts, path: Path, events: Events, theta: Array, refinements: int = 0) -> Path:
+    """The paths after the impacts of one round; differentiable, with refinements the times of the impacts included."""
+    met = contacts.first(events.contact) == jnp.arange(contacts.count)
+    start = contacts.both(jnp.maximum, path.s)
+    follows = met & contacts.first(events.at_root)
+    s = jnp.where(follows, lax.stop_gradient(contacts.first(events.s)), start)
 
-            s, _, _ = lax.while_loop(lambda state: jnp.any(far(state)), advance, (start, gap(start), 0))
+    def refine(state, _):
+        s, last = state
+        falls = follows & (last.slope < 0)
+        s = jnp.where(falls, s - last.gap / jnp.where(falls, last.slope, -1), s)
+        return (s, contacts.look(path, s)), None
 
-            def newton(_, s):
-                distance, rate = slope(s)
-                return jnp.where(rate < 0, jnp.maximum(start, s - distance / jnp.where(rate < 0, rate, -1)), s)
+    if refinements:
+        blank = jax.tree.map(jnp.zeros_like, jax.eval_shape(contacts.look, path, s))
+        (s, look), _ = lax.scan(refine, (s, blank), length=refinements + 1)
+    else:
+        look = contacts.look(path, s)
 
-            return lax.fori_loop(0, NEWTON_STEPS, newton, s)
+    normal, bend = look.normal, contacts.relative(path.bend)
+    v = look.speed / contacts.dt + look.recession[:, None] * normal
+    plastic = contacts.first(events.plastic)
+    change = bounce(v, normal, jnp.where(plastic, 0, contacts.restitution), contacts.friction)
+    into = jnp.sum(bend * normal, axis=-1)
+    held = jnp.where(plastic & (into < 0), -into, 0)[:, None] * normal  # no more push into what it stays on
 
-        def solve(gap, start):
-            s = search(gap, start)
-            roundoff = self.roundoff(path.x)
-            distance, rate = slope(start)
-            touching = (distance <= roundoff) & (rate < -roundoff)  # a slower approach is rounding, not an impact
-            inside = distance < -roundoff  # overlap from the start: no root to follow
-            distance, rate = slope(s)
-            meeting = (s <= 1) & (rate < -roundoff) & (jnp.abs(distance) <= roundoff + 1e-6 * length(way))
-            return s, (touching, inside, meeting)
+    response = contacts.response()
+    per_mass = jnp.where(met & (response > 0), 1 / jnp.where(response > 0, response, 1), 0)[:, None]
+    both = contacts.push(per_mass * jnp.concatenate([change, held], axis=1))
+    kick, hold = both[:, : contacts.dim], both[:, contacts.dim :]
+    own_s = spread(contacts, path.s, s, met)
+    hit = (events.contact >= 0)[:, None]
+    late = (1 - own_s)[:, None] + 0.5 - theta
+    return Path(
+        own_s,
+        jnp.where(hit, path.position(own_s), path.x),
+        jnp.where(hit, path.speed(own_s) + contacts.dt * kick, path.way),
+        path.bend + hold,
+        path.jump + kick + late * hold / contacts.dt,
+        path.hit | hit[:, 0],
+    )
 
-        def tangent_solve(matvec, b):
-            rate = matvec(jnp.ones_like(b))
-            return jnp.where(rate < 0, b / jnp.where(rate < 0, rate, -1), 0)
 
-        s, (touching, inside, meeting) = root(gap, path.s, solve, tangent_solve)
-        at_once = jnp.where(inside, path.s, lax.stop_gradient(path.s - s) + s)  # value path.s, slope of the root
-        s = jnp.where(touching, at_once, jnp.where(meeting, s, jnp.inf))
-        return jnp.where(path.flying & (self.inverse_mass > 0), s, jnp.inf)
+def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Array:
+    """y with the value of its contact for each particle that met one."""
+    n = contacts.particles
+    for k in range(len(contacts.colliders)):
+        own = slice(k * n, (k + 1) * n)
+        y = jnp.where(met[own], per_contact[own], y)
+    if len(contacts.i):
+        pairs = per_contact[contacts.walls :]
+        for body in (contacts.i, contacts.j):
+            y = y.at[jnp.where(met[contacts.walls :], body, n)].set(pairs, mode="drop")
+    return y
 
-    def time_of_meeting(self, path: Path) -> Array:
-        """When the two balls of each pair meet next, a part of the step, inf where they do not; (pair,)."""
-        way = path.displacement(self.dt)
-        start = jnp.maximum(path.s[self.i], path.s[self.j])
 
-        def at_start(k):
-            return path.x[k] + (start - path.s[k])[:, None] * way[k]
+def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: int) -> tuple[Events, Array]:
+    """The impacts of all rounds, each leaf (round, particle), and the number of contacts left after the last one."""
+    none = jnp.full(contacts.particles, -1, jnp.int32)
+    no = jnp.zeros(contacts.particles, bool)
+    empty = Events(none, jnp.zeros_like(path.s), no, no)
+    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds, *x.shape)), empty)
 
-        # |apart + (s - start) way| = reach, the first root
-        apart, way = at_start(self.i) - at_start(self.j), way[self.i] - way[self.j]
-        a, b = jnp.sum(way * way, axis=-1), jnp.sum(apart * way, axis=-1)
-        c = jnp.sum(apart * apart, axis=-1) - (self.radius[self.i] + self.radius[self.j]) ** 2
-        size, eps = jnp.max(jnp.abs(path.x)) + jnp.max(self.radius), jnp.finfo(c.dtype).eps
-        touching = (c <= 64 * eps * size**2) & (b < -16 * eps * size * length(apart))
-        crossing = (b < 0) & (b * b > a * c)
-        root_of = jnp.sqrt(jnp.where(crossing, b * b - a * c, 1))
-        delay = jnp.where(crossing, c / jnp.where(crossing, root_of - b, 1), jnp.inf)
-        s = start + jnp.where(touching, 0, delay)
-        return jnp.where((s <= 1) & self.both_alive, s, jnp.inf)
+    def one(state):
+        path, record, k, _, _ = state
+        found = next_impacts(contacts, path, slow)
+        events = choose(contacts, found)
+        events = events._replace(plastic=events.plastic | (k == rounds - 1))
+        any_left = jnp.any(events.contact >= 0)
+        left = jnp.where(k == rounds, jnp.sum(jnp.isfinite(found.s) & ~found.plastic), 0).astype(jnp.int32)
+        record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)
+        return apply(contacts, path, events, theta), record, k + 1, any_left, left
 
-    def first_of_their_balls(self, now: Array, times: Array, first: Array, done: Array) -> Array:
-        """The pairs whose meeting is the next impact of both their balls; at a tie, the pair written first."""
-        i, j = self.i, self.j
-        now = now & (times == first[i]) & (times == first[j]) & ~done[i] & ~done[j]
-        rank = jnp.where(now, jnp.arange(len(i)), len(i))
-        winner = jnp.full(len(first), len(i)).at[i].min(rank).at[j].min(rank)
-        return now & (winner[i] == rank) & (winner[j] == rank)
+    def go_on(state):
+        _, _, k, any_left, _ = state
+        return any_left & (k <= rounds)
 
-    def bounce(self, v: Array, normal: Array, recession: Any, restitution: Any) -> tuple[Array, Array]:
-        """The change of velocity by an impact, and the part of the tangential velocity that friction leaves."""
-        v_n = jnp.sum(v * normal, axis=-1)
-        push = -(1 + restitution) * jnp.minimum(v_n + recession, 0)
-        v_t = v - v_n[..., None] * normal
-        speed = length(v_t)
-        held = self.friction * push >= speed
-        left = jnp.where(held, 0, 1 - self.friction * push / jnp.where(held, 1, speed))
-        return push[..., None] * normal - (1 - left)[..., None] * v_t, left
+    start = path, record, jnp.int32(0), jnp.asarray(True), jnp.int32(0)
+    _, record, _, _, left = lax.while_loop(go_on, one, start)
+    return record, left
 
-    def exchange(self, now: Array, x: Array, v: Array, restitution: Any) -> Array:
-        """The changes of velocity, (particle, dim), by the impacts of the pairs that meet now; momentum is kept."""
-        i, j = self.i, self.j
-        change, _ = self.bounce(v[i] - v[j], unit(x[i] - x[j]), 0, restitution)
-        return self.share(jnp.where(now[:, None], change, 0))
 
-    def share(self, change: Array) -> Array:
-        """A change of x_i - x_j for each pair, (pair, dim), shared between its balls by their inverse masses."""
-        w_i, w_j = self.inverse_mass[self.i], self.inverse_mass[self.j]
-        total = jnp.where(w_i + w_j > 0, w_i + w_j, 1)
-        shared = jnp.zeros((len(self.radius), change.shape[-1]), change.dtype)
-        shared = shared.at[self.i].add((w_i / total)[:, None] * change)
-        return shared.at[self.j].add(-(w_j / total)[:, None] * change)
+def go_through(contacts: Contacts, path: Path, events: Events, theta: Array) -> Path:
+    """The paths after all rounds of a schedule."""
 
-    def rest(self, path: Path, v: Array) -> tuple[Array, Array]:
-        """Position and velocity at the end of the step; who still overlaps then is put on the surface and stays."""
-        end = jnp.ones_like(path.s)
-        x = path.x + (end - path.s)[:, None] * path.displacement(self.dt)
-        if len(self.i):
-            apart = x[self.i] - x[self.j]
-            reach = self.radius[self.i] + self.radius[self.j]
-            overlap = jnp.where(self.both_alive, reach - length(apart), 0)
-            v = v + self.exchange(overlap > 0, x, v, 0)
-            x = x + self.share(jnp.maximum(overlap, 0)[:, None] * unit(apart))
-        for collider in self.colliders:
-            gap = self.gap(collider, end, x)
-            on_it = (gap <= self.roundoff(x)) & (self.gap(collider, path.s, path.x) <= self.roundoff(path.x))
-            normal, recession = jax.vmap(normal_and_speed, (None, 0, 0))(collider, self.t0 + end * self.dt, x)
-            stop, left = self.bounce(v, normal, recession, 0)
-            slide = x - path.x
-            slide = slide - jnp.sum(slide * normal, axis=-1, keepdims=True) * normal
-            under = gap < -self.roundoff(x)  # a bounce that ends with the step is on the surface, and leaves it
-            staying = on_it & (jnp.sum(v * normal, axis=-1) + recession <= 0)
-            touching = ((under | staying) & (self.inverse_mass > 0))[:, None]
-            x = x - jnp.where(touching, gap[:, None] * normal + (1 - left)[:, None] * slide, 0)
-            v = v + jnp.where(touching, stop, 0)
-        return x, v
+    def one(path, events):
+        happens = jnp.any(events.contact >= 0)
+        return lax.cond(
+            happens, lambda path: apply(contacts, path, events, theta, REFINEMENTS), lambda path: path, path
+        ), None
+
+    return lax.scan(one, path, events)[0]

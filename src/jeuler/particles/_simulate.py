@@ -127,7 +127,15 @@ def _simulate(
     motion, rest = split_state(state)
     start = (motion, rest), no_remainder(motion, compensated)
     within = in_windows(windows, scene, state, grid.save_every)
-    return scan_grid(scene_step, start, grid, saved, watch=lambda parts: parts[0], within=within)
+    return scan_grid(
+        scene_step,
+        start,
+        grid,
+        saved,
+        watch=lambda parts: parts[0],
+        within=within,
+        unresolved=lambda parts: parts[1].unresolved_contacts,
+    )
 
 
 def check_run(

@@ -120,6 +120,9 @@ class EffectHooks(Effect, Protocol):
     random: bool
     """Whether it needs a key."""
 
+    gives_way: bool
+    """Whether it gets mass inf for prescribed particles, as for pinned ones."""
+
     max_births: int | None
     """The most births in a step, None for no limit: windows must hold them."""
 
@@ -151,6 +154,6 @@ class SamplerHooks(Sampler, Protocol):
 
 
 HOOKS = (
-    "acts", "at", "check", "drag", "energy", "max_births", "numbers", "prepare", "prescribe", "random", "reads",
+    "acts", "at", "check", "drag", "energy", "gives_way", "max_births", "numbers", "prepare", "prescribe", "random", "reads",
     "sets", "writes",
 )  # fmt: skip

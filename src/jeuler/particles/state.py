@@ -49,6 +49,7 @@ class ParticleState:
       shape: (particle,), integer, the marker that is drawn: 0 circle, 1 square, 2 triangle, 3 diamond, 4 star.
       births: () int32, the number of particles born since the start.
       missed_births: () int32, the births that found no free slot.
+      unresolved_contacts: () int32, impacts and overlaps that `Collisions` did not resolve.
       extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
     Raises: ValueError, if a field is not an array of numbers; `simulate` checks the shapes.
     Example:
@@ -72,6 +73,7 @@ class ParticleState:
     shape: OptionalParameter = default(None)
     births: OptionalParameter = default(None)
     missed_births: OptionalParameter = default(None)
+    unresolved_contacts: OptionalParameter = default(None)
     extra: dict[str, Array] | None = None
 
     def __post_init__(self) -> None:
@@ -222,7 +224,7 @@ def with_default_fields(
         if name == "mass":
             values[name] = jnp.broadcast_to(state.mass, (particles,))
         elif name not in state.fields():
-            if name in COUNTERS:
+            if name in (*COUNTERS, "unresolved_contacts"):
                 values[name] = jnp.int32(0)
             else:
                 shape, value = DEFAULTS.get(name, ((shapes or {}).get(name, ()), 0.0))

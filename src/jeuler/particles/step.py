@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.calls import with_previous
+from jeuler._core.component import replace
 from jeuler._core.components import split, stack
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import BEFORE, acts, declared, name_of
@@ -96,7 +98,19 @@ class SceneStep:
             if (acts(effect) == BEFORE) == early:
                 key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n), k)
                 clock = {"clock": (n, self.grid.t0)} if declared(effect, "counts_steps", False) else {}
-                yield f"effects[{k}] {name_of(effect)}", functools.partial(with_previous(effect, ""), key=key, **clock)
+                act = functools.partial(with_previous(effect, ""), key=key, **clock)
+                if declared(effect, "gives_way", False) and self.equation.effects:
+                    act = functools.partial(self._with_prescribed_pinned, act)
+                yield f"effects[{k}] {name_of(effect)}", act
+
+    def _with_prescribed_pinned(
+        self, act: Callable, t: Any, dt: Any, previous: ParticleState, state: ParticleState
+    ) -> ParticleState:
+        """The effect on a state in which prescribed particles have mass inf, whatever mass they have."""
+        mass = jnp.broadcast_to(state.mass, (len(state.position),))
+        for indices, *_ in self.equation.prescribed(t, state.position.dtype):
+            mass = mass.at[indices].set(jnp.inf)
+        return replace(act(t, dt, previous, replace(state, mass=mass)), mass=state.mass)
 
     def field(self, t: Any, motion: tuple[Any, ...], attributes: Any) -> tuple[Any, ...]:
         """The equation of motion by component, as the motion is carried from step to step."""

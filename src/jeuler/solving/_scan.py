@@ -52,6 +52,7 @@ class Solution:
       y: the saved states, or what ``save`` made of them: a pytree with leading axis saved, the initial value first.
       first_nonfinite: int32 scalar: -1, or the 1-based number of the first step whose result is not finite.
         Under ``vmap`` one number a batch member.
+      unresolved_contacts: int32 scalar, the impacts and overlaps that `Collisions` did not resolve; 0 without contact.
     Example:
       >>> import jeuler
       >>> run = jeuler.solve(lambda t, y, args: y * y, 1.0, dt=0.5, num_steps=20, save_every=10)
@@ -62,6 +63,7 @@ class Solution:
     t: Array
     y: PyTree
     first_nonfinite: Array
+    unresolved_contacts: Array | int = 0
 
     def __getattr__(self, name: str) -> Any:
         own = ("t", "y", "first_nonfinite")
@@ -281,6 +283,7 @@ def scan_grid(
     save: Callable[[Array, PyTree], PyTree] | None,
     watch: Callable[[PyTree], PyTree] = lambda y: y,
     within: Callable[[Callable[[PyTree], PyTree], PyTree], PyTree] = lambda run, carry: run(carry),
+    unresolved: Callable[[PyTree], Any] = lambda y: None,
 ) -> Solution:
     """Carry (y, extra) over the grid by ``next_state(n, t, (y, extra))``, saving y and watching for the non-finite.
 
@@ -307,9 +310,10 @@ def scan_grid(
     counter = jnp.int32 if grid.num_steps <= COUNTER else jnp.int64
     carry = (jnp.zeros((), counter), jnp.full((), -1, counter), start)
     blocks = None if grid.segment is None else max(1, grid.segment // grid.save_every)
-    (_, first_nonfinite, _), rest = _scan(one_save, carry, grid.num_steps // grid.save_every, blocks)
+    (_, first_nonfinite, (last, _)), rest = _scan(one_save, carry, grid.num_steps // grid.save_every, blocks)
     t, y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), saved(carry), rest)
-    return Solution(t, y, first_nonfinite)
+    left = unresolved(last)
+    return Solution(t, y, first_nonfinite, jnp.int32(0) if left is None else left)
 
 
 def _segment_length(checkpoint: Checkpoint, num_steps: int) -> int | None:

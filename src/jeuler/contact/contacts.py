@@ -1,0 +1,170 @@
+"""What can touch what in one step: particles and colliders, and pairs of balls, as one list of contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jeuler._core.vectors import direction, length, unit
+from jeuler.contact.paths import Path
+
+TOUCH, LIFT = 8, 16  # units in the last place of the coordinates
+CANDIDATES = 2  # pairs followed in a step, for each particle and dimension, where there are many more of them
+
+
+class Look(NamedTuple):
+    """What there is to know of each contact at one time of its own."""
+
+    gap: Array  # (contact,), distance between the surfaces, m
+    slope: Array  # (contact,), d gap / ds, m a step
+    normal: Array  # (contact, dim), on the first partner
+    recession: Array  # (contact,), speed of the surface away from it, m/s
+    speed: Array  # (contact, dim), relative dx/ds of the partners, m a step
+
+
+class Contacts:
+    """The contacts of one step: first each collider with all particles, in their order, then the pairs.
+
+    An array with one row a contact has leading axis ``contact`` = colliders * particles + pairs.
+    """
+
+    def __init__(self, collisions: Any, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None) -> None:
+        dtype = x.dtype
+        self.colliders, self.particles, self.dim = collisions.colliders, *x.shape
+        self.t0, self.dt = t0.astype(dtype), dt.astype(dtype)
+        self.restitution, self.friction = collisions.restitution.astype(dtype), collisions.friction.astype(dtype)
+        self.radius = jnp.broadcast_to(collisions.radius.astype(dtype), self.particles)
+        mass = mass if alive is None else jnp.where(alive, mass, jnp.inf)  # whatever the mass of a dead slot is
+        self.inverse_mass = jnp.broadcast_to(1 / mass.astype(dtype), self.particles)
+        self.alive = jnp.ones(self.particles, bool) if alive is None else alive
+        self.i, self.j = (jnp.asarray(k) for k in np.array(collisions.pairs, np.int32).reshape(-1, 2).T)
+        self.listed = jnp.ones(len(self.i), bool)
+        self.left_out = jnp.int32(0)
+        self.lift: list[Array | float] = [0.0] * len(self.colliders)
+
+    @property
+    def walls(self) -> int:
+        return len(self.colliders) * self.particles
+
+    @property
+    def count(self) -> int:
+        return self.walls + len(self.i)
+
+    def near(self, path: Path) -> None:
+        """Where there are many pairs, keep those that can meet in this step, and count those beyond the capacity.
+
+        Balls that are further apart than four times the longest way of any of them do not meet.
+        """
+        capacity = CANDIDATES * self.dim * self.particles
+        if len(self.i) <= 2 * capacity:
+            return
+        way = jax.lax.stop_gradient(length(path.way) + length(path.bend))
+        x = jax.lax.stop_gradient(path.x)
+        apart = length(x[self.i] - x[self.j]) - self.radius[self.i] - self.radius[self.j]
+        can = (apart <= 4 * jnp.max(way)) & self.alive[self.i] & self.alive[self.j]
+        kept = jnp.nonzero(can, size=capacity, fill_value=0)[0]
+        number = jnp.sum(can)
+        self.left_out = jnp.maximum(number - capacity, 0).astype(jnp.int32)
+        self.i, self.j = self.i[kept], self.j[kept]
+        self.listed = jnp.arange(capacity) < number
+
+    def possible(self) -> Array:
+        """Which contacts there are: alive, and something of it can move."""
+        wall = jnp.tile(self.alive & (self.inverse_mass > 0), len(self.colliders))
+        moves = self.inverse_mass[self.i] + self.inverse_mass[self.j] > 0
+        return jnp.concatenate([wall, self.listed & self.alive[self.i] & self.alive[self.j] & moves])
+
+    def first(self, y: Array) -> Array:
+        """What the first partner of each contact has of y, (particle, ...)."""
+        return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i]] if len(self.i) else [])])
+
+    def relative(self, y: Array) -> Array:
+        """y of the first partner less that of the second; of a particle at a collider just y."""
+        return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i] - y[self.j]] if len(self.i) else [])])
+
+    def both(self, join: Callable[[Array, Array], Array], y: Array) -> Array:
+        """join(y of the first, y of the second), where there is no second y of the first; y is (particle,)."""
+        return jnp.concatenate([*[y] * len(self.colliders), *([join(y[self.i], y[self.j])] if len(self.i) else [])])
+
+    def response(self) -> Array:
+        """The change of the relative velocity by a unit of impulse, (contact,), 1/kg."""
+        return self.both(jnp.add, self.inverse_mass)
+
+    def gather(self, per_contact: Array) -> Array:
+        """The sum of what contacts give: added to the first partner, taken from the second; (particle, ...)."""
+        total = jnp.zeros((self.particles, *per_contact.shape[1:]), per_contact.dtype)
+        for k in range(len(self.colliders)):
+            total = total + per_contact[k * self.particles : (k + 1) * self.particles]
+        if len(self.i):
+            pairs = per_contact[self.walls :]
+            total = total.at[self.i].add(pairs).at[self.j].add(-pairs)
+        return total
+
+    def push(self, impulse: Array) -> Array:
+        """The changes of velocity, (particle, dim), by impulses (contact, dim) on the first partners."""
+        return self.inverse_mass[:, None] * self.gather(impulse)
+
+    def look(self, path: Path, s: Array) -> Look:
+        """What there is to know of each contact where its partners are at its own s."""
+        parts = [self._look_at_collider(k, path, s) for k in range(len(self.colliders))]
+        if len(self.i):
+            parts.append(self._look_at_pairs(path, s[self.walls :]))
+        return Look(*map(jnp.concatenate, zip(*parts, strict=True)))
+
+    def _look_at_collider(self, k: int, path: Path, s: Array) -> Look:
+        s = s[k * self.particles : (k + 1) * self.particles]
+        x, speed = path.position(s) + self.lift[k], path.speed(s)
+        of_both = jax.vmap(jax.value_and_grad(self.colliders[k], argnums=(0, 1)))
+        distance, (recession, slope) = of_both(self.t0 + s * self.dt, x)
+        along = jnp.sum(slope * speed, axis=-1) + self.dt * recession
+        return Look(distance - self.radius, along, unit(slope), recession, speed)
+
+    def _look_at_pairs(self, path: Path, s: Array) -> Look:
+        table = jnp.concatenate([path.x, path.way, path.bend, path.s[:, None]], axis=1)
+
+        def ball(k):
+            x, way, bend, since = jnp.split(table[k], [self.dim, 2 * self.dim, 3 * self.dim], axis=1)
+            part = s[:, None] - since
+            return x + part * (way + part / 2 * bend), way + part * bend
+
+        (x, speed), (y, other) = ball(self.i), ball(self.j)
+        distance, normal = direction(x - y)
+        along = jnp.sum(normal * (speed - other), axis=-1)
+        gap = distance[:, 0] - self.radius[self.i] - self.radius[self.j]
+        return Look(gap, along, normal, jnp.zeros_like(gap), speed - other)
+
+    def roundoff(self, x: Array) -> Array:
+        """What a gap of zero may look like, (contact,), m."""
+        size = jnp.max(jnp.abs(x), axis=-1) + self.radius
+        return jax.lax.stop_gradient(TOUCH * jnp.finfo(x.dtype).eps * self.both(jnp.maximum, size))
+
+    def lift_off(self, path: Path) -> None:
+        """Hold a particle that touches a collider a few roundings above it when it is tried against the others.
+
+        So it passes over an edge that is flush with what it slides on.
+        """
+        if len(self.colliders) < 2:
+            return
+        self.lift = [0.0] * len(self.colliders)
+        n = self.particles
+        parts = [self._look_at_collider(k, path, jnp.tile(path.s, k + 1)) for k in range(len(self.colliders))]
+        gap, normal = (jnp.concatenate([getattr(part, name) for part in parts]) for name in ("gap", "normal"))
+        small = self.roundoff(path.x)
+        walls = [slice(k * n, (k + 1) * n) for k in range(len(self.colliders))]
+        touching = (gap <= small)[:, None]
+        for k, own in enumerate(walls):
+            others = [
+                jnp.where(
+                    touching[m] & (jnp.sum(normal[m] * normal[own], axis=-1, keepdims=True) > -1e-3),
+                    LIFT / TOUCH * small[m][:, None] * normal[m],
+                    0,
+                )
+                for m in walls
+                if m != own
+            ]
+            self.lift[k] = jax.lax.stop_gradient(sum(others[1:], others[0]))
