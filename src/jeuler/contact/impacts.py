@@ -188,17 +188,17 @@ def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Arra
 
 
 def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: int) -> tuple[Events, Array]:
-    """The impacts of all rounds, each leaf (round, particle), and the number of contacts left after the last one."""
+    """The impacts of all rounds and of one more, which rest, each leaf (round, particle); and the number of these."""
     none = jnp.full(contacts.particles, -1, jnp.int32)
     no = jnp.zeros(contacts.particles, bool)
     empty = Events(none, jnp.zeros_like(path.s), no, no)
-    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds, *x.shape)), empty)
+    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds + 1, *x.shape)), empty)
 
     def one(state):
         path, record, k, _, _ = state
         found = next_impacts(contacts, path, slow)
         events = choose(contacts, found)
-        events = events._replace(plastic=events.plastic | (k == rounds - 1))
+        events = events._replace(plastic=events.plastic | (k == rounds))
         any_left = jnp.any(events.contact >= 0)
         left = jnp.where(k == rounds, jnp.sum(jnp.isfinite(found.s) & ~found.plastic), 0).astype(jnp.int32)
         record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)

@@ -9,8 +9,8 @@ point of a projection (P. Alart, A. Curnier, 1991)
 
     p = proj(p - r v(end)),   proj(y) = y_n^+ n + y_t min(1, friction y_n^+ / |y_t|)
 
-it is iterated with Nesterov's acceleration and restarts (H. Mazhar et al., ACM Transactions on Graphics 34, 2015, who do
-so on the friction cone), r the inverse of each contact's response, split among the contacts of a ball (R. Tonge et
+it is iterated with Nesterov's acceleration and restarts (H. Mazhar et al., ACM Transactions on Graphics 34, 2015, who
+do so on the friction cone), r the inverse of each contact's response, split among the contacts of a ball (R. Tonge et
 al., ACM Transactions on Graphics 31, 2012). One step of Newton's method on the same equation ends it, and gives the
 derivatives: those of the implicit function theorem on the active set.
 """

@@ -154,6 +154,6 @@ class SamplerHooks(Sampler, Protocol):
 
 
 HOOKS = (
-    "acts", "at", "check", "drag", "energy", "gives_way", "max_births", "numbers", "prepare", "prescribe", "random", "reads",
-    "sets", "writes",
+    "acts", "at", "check", "drag", "energy", "gives_way", "max_births", "numbers", "prepare", "prescribe", "random",
+    "reads", "sets", "writes",
 )  # fmt: skip

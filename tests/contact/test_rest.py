@@ -1,0 +1,115 @@
+"""What touches: stacks, overlaps, friction that holds, edges, contacts at the end of a step; and what is counted."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+from jeuler import Box, Collisions, Plane
+
+FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
+GRAVITY = jeuler.Gravity([0.0, -9.8])
+
+
+def run(contact, position, velocity, *, dt, num_steps, forces=(GRAVITY,), effects=(), mass=1.0, **how):
+    state = jeuler.ParticleState(jnp.asarray(position), jnp.asarray(velocity), mass=mass)
+    return jeuler.simulate(jeuler.Scene(forces, (*effects, contact)), state, dt=dt, num_steps=num_steps, **how)
+
+
+def test_three_stacked_balls_stay_where_they_are():
+    stack = Collisions((FLOOR,), pairs=[(0, 1), (1, 2)], radius=0.1)
+    position = np.array([[0.0, 0.1], [0.0, 0.3], [0.0, 0.5]])
+    end = run(stack, position, 0 * position, dt=1 / 60, num_steps=2000, save_every=100)
+    np.testing.assert_allclose(end.y.position, np.broadcast_to(position, end.y.position.shape), atol=1e-6)
+    assert int(end.unresolved_contacts) == 0
+
+
+def test_overlapping_balls_part_and_do_not_fly_off():
+    pair = Collisions(pairs=[(0, 1)], radius=0.1)
+    end = run(pair, [[0.0], [0.19]], [[1.0], [np.nextafter(1.0, 0)]], dt=0.1, num_steps=1, forces=()).y
+    np.testing.assert_allclose(end.position[-1, :, 0], [0.095, 0.295], atol=1e-12)
+    np.testing.assert_allclose(end.velocity[-1, :, 0], 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_gradient_of_two_elastic_balls_that_meet_at_the_end_of_a_step(dtype):
+    def end(q):
+        state = jeuler.ParticleState(q[:2, None], q[2:, None])
+        scene = jeuler.Scene(effects=(Collisions(pairs=[(0, 1)], radius=0.1, restitution=1.0),))
+        return jeuler.simulate(scene, state, dt=q.dtype.type(0.01), num_steps=100).y.position[-1, 1, 0]
+
+    several = jnp.array(
+        [[0.0, 0.52, 1.0, 0.0], [0.0, 0.3, 1.0, 0.0], [0.1, 0.4, 0.5, -0.5], [0.0, 0.2, 1.0, 0.5]], dtype
+    )
+    value, gradient = jax.jit(jax.vmap(jax.value_and_grad(end)))(several)
+    np.testing.assert_allclose(value, several[:, 0] + 0.2 + several[:, 2], rtol=1e-5)
+    np.testing.assert_allclose(gradient, np.broadcast_to([1, 0, 1, 0], (4, 4)), atol=1e-5)
+
+
+def test_normal_impact_keeps_the_tangential_gradient():
+    def end(speed):
+        bouncing = Collisions((FLOOR,), restitution=0.8)
+        return run(bouncing, [[0.0, 1.0]], jnp.stack([speed, 0.0])[None], dt=0.01, num_steps=100).y.position[-1, 0, 0]
+
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(end)))(jnp.array([0.0, 1e-9, 0.5])), 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "step", [jeuler.euler_step, jeuler.symplectic_euler_step, jeuler.rk4_step, jeuler.implicit_euler_step]
+)
+def test_friction_below_its_limit_moves_nothing_and_has_gradient_zero(step):
+    angle = np.deg2rad(20.0)
+    normal = np.array([-np.sin(angle), np.cos(angle)])
+
+    def end(friction, restitution):
+        block = Collisions((Plane([0.0, 0.0], normal),), friction=friction, restitution=restitution, radius=0.1)
+        last = run(block, 0.1 * normal[None], np.zeros((1, 2)), dt=0.01, num_steps=1000, save_every=1000, step=step)
+        return jnp.sum(last.y.position[-1, 0] @ jnp.array([np.cos(angle), np.sin(angle)]))
+
+    moved, slope = jax.jit(jax.vmap(jax.value_and_grad(end), (None, 0)))(0.5, jnp.array([0.0, 0.3, 0.8]))
+    np.testing.assert_allclose(moved, 0, atol=1e-9)
+    np.testing.assert_allclose(slope, 0, atol=1e-9)
+
+
+def test_point_slides_over_a_flush_edge():
+    end = run(Collisions((FLOOR, Box([2.0, -1.0], 1.0))), [[0.0, 0.0]], [[1.0, 0.0]], dt=0.01, num_steps=200).y
+    np.testing.assert_allclose(end.position[-1, 0], [2.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(end.velocity[-1, 0], [1.0, 0.0], atol=1e-9)
+
+
+def thin_wall(place):
+    return lambda t, p: jnp.abs(p[0] - place) - 1e-4
+
+
+def test_many_bounces_in_a_step_are_followed_or_counted():
+    walls = thin_wall(0.0), thin_wall(1.0)
+    end = run(Collisions(walls, restitution=1.0), [[0.5]], [[50.0]], dt=0.1, num_steps=2, forces=())
+    assert np.all((end.y.position >= 0) & (end.y.position <= 1))
+    np.testing.assert_allclose(np.abs(end.y.velocity[-1]), 50, rtol=1e-9)
+    assert int(end.unresolved_contacts) == 0
+    few = Collisions(walls, restitution=1.0, max_bounces=2)
+    assert int(run(few, [[0.5]], [[50.0]], dt=0.1, num_steps=2, forces=()).unresolved_contacts) > 0
+
+
+def test_cradle_of_eight_touching_balls():
+    position = np.concatenate([[0.0], 0.5 + 0.2 * np.arange(7)])[:, None]
+    velocity = np.eye(8)[:, :1]
+    cradle = Collisions(pairs=[(k, k + 1) for k in range(7)], radius=0.1, restitution=1.0)
+    end = run(cradle, position, velocity, dt=0.1, num_steps=10, forces=())
+    np.testing.assert_allclose(end.y.velocity[-1, :, 0], np.eye(8)[7], atol=1e-9)
+    assert int(end.unresolved_contacts) == 0
+
+
+@pytest.mark.parametrize("mass", [np.inf, 1.0])
+def test_prescribed_paddle_is_not_pushed(mass):
+    paddle = jeuler.PrescribedMotion([0], lambda t: jnp.stack([0.3 * t])[None])
+    ball = Collisions(pairs=[(0, 1)], radius=0.1, restitution=1.0)
+    how = {"forces": (), "effects": (paddle,), "mass": jnp.array([mass, 1.0])}
+    end = run(ball, [[0.0], [0.5]], np.zeros((2, 1)), dt=0.013, num_steps=150, **how).y
+    np.testing.assert_allclose(end.velocity[-1, :, 0], [0.3, 0.6], rtol=1e-9)
+
+
+def test_surface_that_is_nan_is_announced():
+    end = run(Collisions((lambda t, p: p[1] * jnp.nan,)), [[0.0, 3.0]], [[0.0, -5.0]], dt=0.1, num_steps=10)
+    assert int(end.first_nonfinite) == 1
