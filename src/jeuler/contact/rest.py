@@ -57,7 +57,8 @@ def contact_forces(contacts: Contacts, normal: Array, velocity: Array, active: A
         return Forces(improve(jnp.zeros_like(velocity), velocity), jnp.int32(0))
     p, error = _iterate(improve, rate, lax.stop_gradient(velocity))
     scale = jnp.max(jnp.where(active, length(velocity), 0), initial=0)
-    unresolved = jnp.sum(active & (error > 1e-3 * scale)).astype(jnp.int32)
+    rounding = 64 * jnp.finfo(velocity.dtype).eps * jnp.max(length(velocity), initial=0)
+    unresolved = jnp.sum(active & (error > 1e-3 * scale + rounding)).astype(jnp.int32)
     return Forces(_newton(lambda p: p - improve(p, velocity), p), unresolved)
 
 
