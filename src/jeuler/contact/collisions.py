@@ -83,6 +83,8 @@ class Collisions:
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
+        if not self.colliders and not self.pairs:
+            return state
         if previous is None:
             previous = dataclasses.replace(state, position=state.position - dt * state.velocity)
         x, v = previous.position, previous.velocity
