@@ -151,7 +151,7 @@ def not_negative(name: str, x: Any, unit: str) -> None:
         where = f" at index {', '.join(map(str, below[0]))}" if np.ndim(x) else ""
         raise ValueError(
             f"{name} must not be negative, got {_at(x, below[0])}{unit and ' ' + unit}{where}; "
-            f"where gradient steps made it so, take them on its logarithm and pass jnp.exp of that, as `fit` does"
+            f"where gradient steps made it so, keep it at 0 or above, as `fit` does by bounds"
         )
 
 
