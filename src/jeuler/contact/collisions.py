@@ -61,9 +61,8 @@ class Collisions:
     restitution: Parameter = default(0.0)
     friction: Parameter = default(0.0)
     max_bounces: int | None = None
-    gives_way: ClassVar[bool] = True  # to prescribed particles: `simulate` calls it with mass inf for these
 
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("forward time", "prescribed pinned")
 
     def __post_init__(self) -> None:
         if not isinstance(self.colliders, (tuple, list)):

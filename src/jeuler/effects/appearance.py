@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -139,7 +139,7 @@ class SpeedLimit:
 
     limit: Parameter
 
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("forward time",)
 
     def __post_init__(self) -> None:
         store_as_float(self, "limit")

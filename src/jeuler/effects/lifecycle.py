@@ -75,9 +75,7 @@ class Emitter:
     max_births: int | None = None
 
     acts = BEFORE
-    random = True
-    counts_steps = True
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("key", "clock", "forward time")
     limits: ClassVar[Limits] = {"rate": (">= 0", "1/s"), "start": ("", "s"), "stop": ("", "s")}
     may_be_infinite: ClassVar[tuple[str, ...]] = ("start", "stop")
 
@@ -249,7 +247,7 @@ class Lifetime:
     duration: OptionalParameter = default(None)
 
     acts = BEFORE
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("forward time",)
     sets: ClassVar[tuple[str, ...]] = ("age",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
@@ -292,7 +290,7 @@ class Death:
     condition: Callable[[Any, Any], Array]
 
     acts = BEFORE
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("forward time",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
@@ -331,7 +329,7 @@ class DeathOutside:
     high: Parameter
 
     acts = BEFORE
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("forward time",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
@@ -376,7 +374,7 @@ class DeathOnContact:
     margin: Parameter = default(0.0)
 
     acts = BEFORE
-    forward_only = True
+    needs: ClassVar[tuple[str, ...]] = ("forward time",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,17 +11,16 @@ from jax import Array
 
 from jeuler._core import checks, trees
 from jeuler._core.arguments import says_what_to_write
-from jeuler._core.calls import with_previous
 from jeuler._core.component import Function, replace
 from jeuler._core.components import per_particle
 from jeuler._core.limits import check_parameters
 from jeuler._jax import programs
 from jeuler.particles.equation import Equation
-from jeuler.particles.fields import START, acts, declared, name_of, with_required_fields
+from jeuler.particles.fields import START, acts, name_of, needs, with_required_fields
 from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
-from jeuler.particles.step import SceneStep
+from jeuler.particles.step import SceneStep, with_its_needs
 from jeuler.particles.windows import in_windows
 from jeuler.solving._scan import (
     INSTEAD,
@@ -171,7 +169,7 @@ def check_kinds(scene: Any, state: Any) -> None:
 
 def forwards(scene: Scene, dt: Any) -> Any:
     """dt, where the scene can run backwards or dt is above 0; else one ValueError, or NaN where dt is traced."""
-    one_way = [name_of(effect) for effect in scene.effects if declared(effect, "forward_only", False)]
+    one_way = [name_of(effect) for effect in scene.effects if needs(effect, "forward time")]
     if not one_way:
         return dt
     checks.number("dt", dt)
@@ -233,11 +231,11 @@ def _reversibly(run: SceneStep, state: ParticleState, saved: Any) -> Solution:
 def _check_effects(scene: Scene, state: ParticleState, grid: Grid, key: Array | None) -> None:
     """One ValueError if an effect draws random numbers without a key, or returns a state of another form."""
     for effect in scene.effects:
-        if key is None and declared(effect, "random", False):
+        if key is None and needs(effect, "key"):
             raise ValueError(
                 f"simulate needs a key, because {name_of(effect)} draws random numbers; pass key=jax.random.key(0)"
             )
-        act = functools.partial(with_previous(effect, ""), key=key)
+        act = with_its_needs(effect, key, jnp.int32(0), grid.t0)
         after = checks.form_of(name_of(effect), act, grid.t0, grid.dt, state, state)
         if not isinstance(after, ParticleState):
             raise ValueError(f"{name_of(effect)} must return the state, a ParticleState, got {type(after).__name__}")
@@ -262,5 +260,6 @@ def _at_start(scene: Scene, state: ParticleState, grid: Grid, key: Array | None)
     for k, effect in enumerate(scene.effects):
         if acts(effect) == START:
             own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, 2**32 - 1), k)
-            state = with_previous(effect, "")(grid.t0, jnp.zeros_like(grid.dt), state, state, key=own_key)
+            act = with_its_needs(effect, own_key, jnp.int32(0), grid.t0)
+            state = act(grid.t0, jnp.zeros_like(grid.dt), state, state)
     return state if state.alive is None else zero_dead_slots(state)

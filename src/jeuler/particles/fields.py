@@ -13,6 +13,7 @@ F = TypeVar("F", bound=Callable)
 
 BEFORE, AFTER, START = ACTS = ("before motion", "after motion", "start and after motion")
 Acts = Literal["before motion", "after motion", "start and after motion"]
+Need = Literal["key", "clock", "forward time", "prescribed pinned"]
 
 
 def uses(
@@ -76,6 +77,11 @@ def declared(part: Any, what: str, default: Any = ()) -> Any:
 def acts(effect: Any) -> str:
     """When in a step an effect acts, one of `ACTS`."""
     return declared(effect, "acts", BEFORE if declared(effect, "before_motion", False) else AFTER)
+
+
+def needs(effect: Any, what: Need) -> bool:
+    """Whether an effect needs this; ``random = True`` is an older word for a need of a key."""
+    return what in declared(effect, "needs") or (what == "key" and declared(effect, "random", False))
 
 
 def name_of(part: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from jax import Array
 
 from jeuler.forces.drag import Resistance
-from jeuler.particles.fields import Acts
+from jeuler.particles.fields import Acts, Need
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step
 
@@ -117,11 +117,10 @@ class EffectHooks(Effect, Protocol):
     sets: tuple[str, ...] | dict[str, tuple[int, ...]]
     """Fields that it gives to every particle at each step: no other effect may write them."""
 
-    random: bool
-    """Whether it needs a key."""
-
-    gives_way: bool
-    """Whether it gets mass inf for prescribed particles, as for pinned ones."""
+    needs: tuple[Need, ...]
+    """What it cannot do without: "key", for random numbers; "clock", ``clock=(n, t0)`` in place of a
+    keyword's default, n the steps taken before this one; "forward time", dt > 0; "prescribed pinned", mass inf of
+    prescribed particles as of pinned ones."""
 
     max_births: int | None
     """The most births in a step, None for no limit: windows must hold them."""
@@ -154,6 +153,6 @@ class SamplerHooks(Sampler, Protocol):
 
 
 HOOKS = (
-    "acts", "at", "check", "drag", "energy", "gives_way", "max_births", "numbers", "prepare", "prescribe", "random",
-    "reads", "sets", "writes",
+    "acts", "at", "check", "drag", "energy", "max_births", "needs", "numbers", "prepare", "prescribe", "reads", "sets",
+    "writes",
 )  # fmt: skip

@@ -16,7 +16,7 @@ from jeuler._core.calls import with_previous
 from jeuler._core.component import replace
 from jeuler._core.components import split, stack
 from jeuler.particles.equation import Equation
-from jeuler.particles.fields import BEFORE, acts, declared, name_of
+from jeuler.particles.fields import BEFORE, acts, name_of, needs
 from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
@@ -97,9 +97,8 @@ class SceneStep:
         for k, effect in enumerate(self.scene.effects):
             if (acts(effect) == BEFORE) == early:
                 key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n), k)
-                clock = {"clock": (n, self.grid.t0)} if declared(effect, "counts_steps", False) else {}
-                act = functools.partial(with_previous(effect, ""), key=key, **clock)
-                if declared(effect, "gives_way", False) and self.equation.effects:
+                act = with_its_needs(effect, key, n, self.grid.t0)
+                if needs(effect, "prescribed pinned") and self.equation.effects:
                     act = functools.partial(self._with_prescribed_pinned, act)
                 yield f"effects[{k}] {name_of(effect)}", act
 
@@ -120,6 +119,12 @@ class SceneStep:
             context = dataclasses.replace(equation.context, particles=len(position))
             equation = Equation.of(self.scene.forces, self.scene.effects, context)
         return tuple(map(split, equation.vector_field(t, (position, velocity), attributes)))
+
+
+def with_its_needs(effect: Any, key: Array | None, n: Any, t0: Array) -> Callable[..., Any]:
+    """The effect as ``effect(t, dt, previous, state)``, with its key and, if it needs it, the clock."""
+    clock = {"clock": (n, t0)} if needs(effect, "clock") else {}
+    return functools.partial(with_previous(effect, ""), key=key, **clock)
 
 
 def on_arrays(step: Step) -> Step:

@@ -1,0 +1,59 @@
+"""One page says what a component may do: thirteen hooks, and the code looks for no others."""
+
+import pathlib
+import re
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jeuler
+from jeuler.particles import protocols
+
+SOURCE = pathlib.Path(jeuler.__file__).parent
+OLDER = {"before_motion", "over_step", "random"}  # words of before that are still taken
+FOR_MESSAGES = {"__name__", "shape", "normal"}  # looked at to say what came in place of a component
+
+
+def test_thirteen_hooks_each_in_a_protocol():
+    classes = [c for c in vars(protocols).values() if isinstance(c, type) and c.__name__.endswith("Hooks")]
+    in_protocols = {name for c in classes for name in (*c.__annotations__, *vars(c)) if not name.startswith("_")}
+    assert in_protocols == set(protocols.HOOKS)
+    assert len(set(protocols.HOOKS)) == len(protocols.HOOKS) <= 13
+
+
+def test_the_particles_look_for_no_other_hook():
+    asked = r'(?:declared|hasattr|getattr)\((?:effect|force|part|other), "([a-z_]+)"'
+    found = {name for path in (SOURCE / "particles").glob("*.py") for name in re.findall(asked, path.read_text())}
+    assert {"acts", "reads"} <= found
+    assert found - OLDER - FOR_MESSAGES <= set(protocols.HOOKS)
+
+
+def test_every_built_in_need_is_one_that_the_page_names():
+    for name in jeuler.effects.__all__ + jeuler.contact.__all__:
+        assert set(getattr(getattr(jeuler, name), "needs", ())) <= {
+            "key",
+            "clock",
+            "forward time",
+            "prescribed pinned",
+        }
+
+
+def test_an_effect_of_ones_own_gets_what_it_needs():
+    seen = {}
+
+    class Counts:
+        needs = ("key", "clock")
+
+        def __call__(self, t, dt, previous, state, key, *, clock=None):
+            seen["clock"] = clock
+            assert key is not None
+            n, t0 = clock
+            return state.replace(position=state.position.at[0, 0].set((t0 + n).astype(state.position.dtype)))
+
+    scene = jeuler.Scene(effects=(Counts(),))
+    state = jeuler.ParticleState(jnp.zeros((1, 1)), jnp.zeros((1, 1)))
+    with pytest.raises(ValueError, match="needs a key"):
+        jeuler.simulate(scene, state, dt=0.1, num_steps=3)
+    run = jeuler.simulate(scene, state, dt=0.1, num_steps=3, t0=10.0, key=jax.random.key(0))
+    assert run.y.position[1:, 0, 0].tolist() == [10.0, 11.0, 12.0]
