@@ -7,7 +7,7 @@ import pytest
 
 import jeuler
 from jeuler.effects.lifecycle import births_of_stream
-from jeuler.solving._scan import Grid
+from jeuler.solving.grid import Grid
 
 KEY = jax.random.key(0)
 

@@ -22,17 +22,8 @@ from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
 from jeuler.particles.step import SceneStep, with_its_needs
 from jeuler.particles.windows import in_windows
-from jeuler.solving._scan import (
-    INSTEAD,
-    Checkpoint,
-    Grid,
-    Solution,
-    check_save,
-    check_step,
-    no_remainder,
-    scan_grid,
-    solve_reversibly,
-)
+from jeuler.solving._scan import INSTEAD, Solution, check_save, check_step, no_remainder, scan_grid, solve_reversibly
+from jeuler.solving.grid import Checkpoint, Grid
 from jeuler.steps.explicit import Step, euler_step
 
 ON_A_SCENE = {"args": "the mass with the state, state.replace(mass=...)", "mass": "state.replace(mass=...)"}

@@ -20,7 +20,8 @@ from jeuler.particles.fields import BEFORE, acts, name_of, needs
 from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
-from jeuler.solving._scan import Grid, advance_by
+from jeuler.solving._scan import advance_by
+from jeuler.solving.grid import Grid
 from jeuler.steps.explicit import Step
 
 

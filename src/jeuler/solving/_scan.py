@@ -1,16 +1,13 @@
-"""``solve`` on a fixed grid of times: the clock, saving, checkpointing, compensated sums, and the Solution."""
+"""``solve`` on a fixed grid of times: saving, checkpointing, compensated sums, and the Solution."""
 
 from __future__ import annotations
 
 import functools
-import math
-import warnings
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from jeuler._core import checks, trees
@@ -23,6 +20,7 @@ from jeuler.solving._breaks import checked_breaks, split_at
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
 from jeuler.solving._tables import solution_table
+from jeuler.solving.grid import COUNTER, Checkpoint, Grid
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -40,7 +38,6 @@ INSTEAD = {
     "rng": "key=jax.random.key(0)",
     "seed": "key=jax.random.key(0)",
 }
-Checkpoint = int | Literal["sqrt", "reversible"] | None
 
 
 @component()
@@ -196,86 +193,6 @@ def solve_reversibly(
     return scan_grid(lambda n, t, state: state, (y0, None), grid, save, within=within)
 
 
-@component(static=("num_steps", "save_every", "segment"))
-class Grid:
-    """When a run steps and saves: checked, and in the precision of the state."""
-
-    dt: Array
-    num_steps: int
-    t0: Array
-    save_every: int
-    segment: int | None
-
-    @classmethod
-    def checked(cls, dt: Any, num_steps: Any, t0: Any, save_every: Any, checkpoint: Checkpoint, dtype: Any) -> Grid:
-        """The grid of these arguments, or one ValueError that says which is wrong."""
-        num_steps = checks.count("num_steps", num_steps)
-        save_every = checks.count("save_every", save_every, least=1)
-        check_counter(num_steps, save_every)
-        if num_steps % save_every:
-            raise ValueError(
-                f"save_every must divide num_steps, got save_every={save_every} and num_steps={num_steps}; "
-                f"take num_steps={math.ceil(num_steps / save_every) * save_every} or another save_every"
-            )
-        check_time_step(dt, t0, dtype)
-        segment = _segment_length(checkpoint, num_steps)
-        dt, t0 = (jnp.asarray(x, dtype) if checks.is_traced(x) else np.asarray(x).astype(dtype) for x in (dt, t0))
-        return cls(dt, num_steps, t0, save_every, segment)
-
-    def clock(self, n: Array) -> Array:
-        """t0 + n dt."""
-        return self.t0 + n.astype(self.dt.dtype) * self.dt
-
-
-COUNTER = 2**31 - 1  # the most steps that an int32 counts
-
-
-def check_counter(num_steps: int, save_every: int) -> None:
-    """One ValueError if the run has more steps than its counter can count, which would turn time negative."""
-    if num_steps <= COUNTER:
-        return
-    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
-        raise ValueError(
-            f"num_steps must be at most {COUNTER:,} where integers have 32 bits, got {num_steps:,}; "
-            f'write jax.config.update("jax_enable_x64", True), or go on from the last state in a second run with its t0'
-        )
-    if max(save_every, num_steps // save_every) > COUNTER:
-        raise ValueError(
-            f"save_every must be such that neither it nor num_steps / save_every is above {COUNTER:,}, "
-            f"got {save_every:,} of {num_steps:,} steps; take save_every={2**20:,}"
-        )
-
-
-def check_time_step(dt: Any, t0: Any, dtype: Any) -> None:
-    """One ValueError if dt is 0, as it is or in the precision of the state; a warning where it does not move the clock.
-
-    A negative dt steps back in time.
-    """
-    checks.number("dt", dt)
-    checks.number("t0", t0)
-    if checks.is_traced(dt):
-        return
-    if not float(dt):
-        raise ValueError("dt must not be 0 s: the run would stand still; negative steps back in time")
-    largest, tiny = float(jnp.finfo(dtype).max), float(jnp.finfo(dtype).tiny)
-    if not tiny <= abs(float(dt)) <= largest:
-        raise ValueError(
-            f"dt must be from {tiny:.2g} to {largest:.2g} s in {jnp.dtype(dtype).name}, the precision of the state, "
-            f"got {float(dt):g}; take another unit of time, or a state in float64"
-        )
-    if checks.is_traced(t0):
-        return
-    if not abs(float(t0)) <= largest:
-        raise ValueError(f"t0 must be below {largest:.2g} s in {jnp.dtype(dtype).name}, got {float(t0):g}")
-    start = np.asarray(t0, dtype)
-    if start + np.asarray(dt, dtype) == start:
-        warnings.warn(
-            f"dt={float(dt):g} s does not move the clock from t0={float(t0):g} s in {start.dtype}, the precision of "
-            f"the state: what depends on t sees it stand still; count t from a nearer t0, or take a state in float64",
-            stacklevel=4,
-        )
-
-
 def scan_grid(
     next_state: Callable[[Array, Array, PyTree], PyTree],
     start: tuple[PyTree, PyTree],
@@ -314,16 +231,6 @@ def scan_grid(
     t, y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), saved(carry), rest)
     left = unresolved(last)
     return Solution(t, y, first_nonfinite, jnp.int32(0) if left is None else left)
-
-
-def _segment_length(checkpoint: Checkpoint, num_steps: int) -> int | None:
-    if checkpoint is None or checkpoint == "reversible":
-        return None
-    if checkpoint == "sqrt":
-        return max(1, math.isqrt(num_steps))
-    if isinstance(checkpoint, str):
-        raise ValueError(f'checkpoint must be None, "sqrt", "reversible" or a number of steps, got {checkpoint!r}')
-    return checks.count("checkpoint", checkpoint, least=1)
 
 
 def _scan(body: Callable[..., Any], carry: PyTree, count: int, segment: int | None) -> tuple[PyTree, PyTree]:
