@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
-from jeuler.fitting.engine import Options, Problem, run
+from jeuler.fitting.engine import run
+from jeuler.fitting.options import Options
+from jeuler.fitting.problem import Problem
 from jeuler.fitting.result import Fit
 
 PyTree = Any
@@ -86,12 +87,11 @@ def fit(
         loss_scale=loss_scale,
         starts=starts,
         optimizer=optimizer,
-        max_iterations=checks.count("max_iterations", max_iterations, least=1),
+        max_iterations=max_iterations,
         tolerance=tolerance,
         resume=resume,
         progress=progress,
     )
-    options.check()
     problem = Problem.of(
         residual, params, data=data, bounds=bounds, positive=positive, sigma=sigma, weights=weights, stages=stages
     )

@@ -12,7 +12,6 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.component import result
 from jeuler.fitting.blind import describe_blind
-from jeuler.fitting.engine import null_directions
 from jeuler.fitting.least_squares import residual_and_jacobian
 from jeuler.fitting.observations import amplitude_of
 from jeuler.fitting.prediction import compiled_positions
@@ -150,7 +149,7 @@ def _judged(problem: Any, x: np.ndarray, jacobian: np.ndarray, sigma: float) -> 
         half = d.vectors * np.where(d.seen, 1 / np.where(d.seen, d.values, 1), 0) / d.norms[:, None]
         covariance = sigma**2 * half @ half.T
         is_blind = 1 - np.sum(np.where(d.seen, d.vectors, 0) ** 2, axis=1) > 1e-6
-    blind = describe_blind(null_directions(d), x, layout.names(readable), np.asarray(problem.lower) >= 0)
+    blind = describe_blind(d.null(), x, layout.names(readable), np.asarray(problem.lower) >= 0)
     error = np.where(is_blind, np.inf, np.sqrt(np.diag(covariance)))
     weak = [n for n, e, v in zip(layout.names(readable), error, x, strict=True) if np.isfinite(e) and e > abs(v) > 0]
     words = [f"nothing would determine {', '.join(blind)}"] if blind else []

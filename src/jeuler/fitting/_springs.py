@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 from jax import Array
 
-from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler.fitting._tables import fit_table
-from jeuler.fitting.engine import Options
+from jeuler.fitting.options import Options
 from jeuler.fitting.parameters import values_of_springs
 from jeuler.fitting.profiles import again_of, keep
 from jeuler.fitting.recorded import Recorded
@@ -24,8 +23,8 @@ PyTree = Any
 
 
 @result
-class SpringFit:
-    """What `fit_springs` found.
+class SpringFit(Fit):
+    """What `fit_springs` found: a `Fit`, with the scene that it belongs to.
 
     Attributes:
       ks, kd: stiffness (N/m) and damping (N s/m) of the fitted scene's `Springs`, fitted or not; where the scene has
@@ -56,34 +55,14 @@ class SpringFit:
       (30.0, True, (41, 2, 1))
     """
 
+    _: dataclasses.KW_ONLY
     ks: Any
     kd: Any
     scene: Scene
     state: ParticleState
-    params: dict[str, Any]
-    loss: Any
-    history: Any
-    stderr: Any
-    covariance: Any
     predicted: Array
-    converged: Any
-    message: str
-    undetermined: tuple[str, ...]
-    nonfinite: Any
-    stderr_white: Any = None
-    residual: Any = None
-    blind: tuple[str, ...] = ()
-    at_bound: tuple[str, ...] = ()
-    explained: Any = None
-    noise_ratio: Any = None
-    autocorrelation: Any = None
-    starts: Any = None
     step_bias: Any = None
     start: str = "given"
-
-    _repr_html_ = fit_table
-    correlation = Fit.correlation
-    profile = Fit.profile
 
 
 as_pytree(SpringFit, ("message", "undetermined", "blind", "at_bound", "start"))
@@ -178,12 +157,11 @@ def fit_springs(
         loss_scale=loss_scale,
         starts=starts,
         optimizer=optimizer,
-        max_iterations=checks.count("max_iterations", max_iterations, least=1),
+        max_iterations=max_iterations,
         tolerance=tolerance,
         resume=resume,
         progress=progress,
     )
-    options.check()
     if start not in ("data", "given"):
         raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
     task = Recorded.of(

@@ -14,10 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jeuler.fitting.engine import NOT_FINITE, Known, Options, Outcome, Problem, progress_bar, report
 from jeuler.fitting.least_squares import Task, start
 from jeuler.fitting.losses import LOSSES
-from jeuler.fitting.problem import FlatResidual
+from jeuler.fitting.minimise import progress_bar
+from jeuler.fitting.options import Known, Options
+from jeuler.fitting.problem import FlatResidual, Problem
+from jeuler.fitting.report import NOT_FINITE, report
+from jeuler.fitting.result import Fit
 
 PROBES = 8  # random directions that estimate the norms of the columns
 MOST_PRODUCTS = 150  # iterations of conjugate gradients in one step
@@ -82,7 +85,7 @@ def _products(residual: FlatResidual, loss: str) -> Products:
     return Products(cost, norms, step)
 
 
-def run_matrix_free(problem: Problem, options: Options, known: Known) -> Outcome:
+def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
     """The fit of a problem whose Jacobian is not formed; standard errors are not worked out."""
     if options.starts is not None or options.resume is not None:
         raise ValueError(
@@ -116,7 +119,7 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Outcome
     )
     more = (*known.more, f"standard errors are not worked out for {len(x)} unknowns")
     told = Known(known.variance, known.noise, more)
-    return Outcome(report(problem, state, history, 1.0, options.loss, words, told), None)
+    return report(problem, state, history, 1.0, options.loss, words, told)
 
 
 def _descend(

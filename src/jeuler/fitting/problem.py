@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -14,10 +14,13 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler.fitting.least_squares import Evaluate, evaluations
-from jeuler.fitting.unknowns import Layout
+from jeuler._core.partition import arrays_only
+from jeuler.fitting.least_squares import Evaluate, Task, evaluations
+from jeuler.fitting.unknowns import Layout, checked_bounds
 
 PyTree = Any
+JACOBIAN_BYTES = 2**30  # a Jacobian larger than this is not formed,
+MOST_COLUMNS = 500  # nor one of more columns: a run of the model for each takes longer than conjugate gradients
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,3 +93,90 @@ def residual_weights(layout: Layout, sigma: PyTree, weights: PyTree) -> Any:
             raise ValueError(f"{name} must leave at least one residual in, got none")
     xp: Any = jnp if checks.is_traced(values) else np
     return xp.sqrt(values) if sigma is None else 1 / values
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A residual with its data, weights, bounds and start, checked."""
+
+    residual: FlatResidual
+    form: Layout  # of what the residual returns
+    data: Any
+    x: Any
+    lower: Any
+    upper: Any
+    weights: Any
+    absolute: bool
+    stages: tuple[Any, ...]
+    closes_over_traced: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        residual: Callable[..., Any],
+        params: PyTree,
+        *,
+        data: PyTree = None,
+        bounds: PyTree = None,
+        positive: PyTree = False,
+        sigma: PyTree = None,
+        weights: PyTree = None,
+        stages: Iterable[PyTree] = (),
+    ) -> Problem:
+        """From what a person passes, or one ValueError that says what is wrong with it."""
+        layout = Layout.of(params)
+        x = layout.vector(params)
+        lower, upper = checked_bounds(layout, x, bounds, positive)
+        with_data = data is not None
+        if with_data:
+            residual, data = arrays_only(residual, data)
+        form, closes_over_traced = residual_layout(residual, params, data, with_data)
+        if not form.size or not layout.size:
+            raise ValueError(
+                f"residual and params must not be empty, got {form.size} residuals and {layout.size} parameters"
+            )
+        weight = residual_weights(form, sigma, weights)
+        masks = tuple(_stage(form, stage, weight) for stage in stages)
+        flat = FlatResidual(residual, layout, with_data)
+        return cls(flat, form, data, x, lower, upper, weight, sigma is not None, masks, closes_over_traced)
+
+    @property
+    def layout(self) -> Layout:
+        return self.residual.layout
+
+    @property
+    def traced(self) -> bool:
+        """Whether any part of it is being traced."""
+        parts = (self.data, self.x, self.lower, self.upper, self.weights, self.stages)
+        return self.closes_over_traced or any(map(checks.is_traced, jax.tree.leaves(parts)))
+
+    @property
+    def small(self) -> bool:
+        """Whether its Jacobian is formed."""
+        n = self.layout.size
+        return self.form.size * n * 8 <= JACOBIAN_BYTES and n <= MOST_COLUMNS
+
+    @property
+    def precision(self) -> float:
+        """The unit roundoff of the residual's arithmetic."""
+        used = [d for d in (*self.form.dtypes, *self.layout.dtypes) if d is not None]
+        return max(float(jnp.finfo(dtype).eps) for dtype in used)
+
+    def task(self, tolerance: float) -> Task:
+        """What the search is given, of NumPy in float64 unless something is traced."""
+        if self.traced:
+            dtype = self.layout.dtype
+            own: list[Any] = [jnp.asarray(a, dtype) for a in (self.weights, self.weights, self.lower, self.upper)]
+            rest: list[Any] = [jnp.asarray(a, dtype) for a in (1.0, tolerance, self.precision, 0.0)]
+        else:
+            own = [np.asarray(a, float) for a in (self.weights, self.weights, self.lower, self.upper)]
+            rest = [np.asarray(a, float) for a in (1.0, tolerance, self.precision, 0.0)]
+        return Task(self.data, *own, *rest)
+
+
+def _stage(form: Layout, stage: PyTree, weight: Any) -> Any:
+    values = form.spread("each of stages", stage, 1.0) if isinstance(stage, (dict, list, tuple)) else stage
+    if np.size(values) != form.size:
+        raise ValueError(f"each of stages must have one weight a residual, {form.size}, got {np.size(values)}")
+    xp: Any = jnp if any(map(checks.is_traced, (values, weight))) else np
+    return weight * xp.sqrt(xp.maximum(xp.ravel(xp.asarray(values)), 0))

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler.fitting.engine import Known, Options, Outcome, Problem, run
+from jeuler.fitting.engine import Outcome, run
 from jeuler.fitting.observations import (
     amplitude_of,
     checked_observations,
@@ -20,8 +20,10 @@ from jeuler.fitting.observations import (
     speed_of,
     variance_of,
 )
+from jeuler.fitting.options import Known, Options
 from jeuler.fitting.parameters import Places
 from jeuler.fitting.prediction import Prediction, compiled_positions, recording
+from jeuler.fitting.problem import Problem
 from jeuler.fitting.result import Fit
 from jeuler.fitting.sampling import aliased
 from jeuler.fitting.step_bias import bias_of_step

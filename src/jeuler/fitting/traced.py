@@ -11,10 +11,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler.fitting import least_squares
-from jeuler.fitting.engine import Options, Problem, errors_of
 from jeuler.fitting.least_squares import State, Task, advance, again, evaluations, start
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import ROUGH, TUNING
+from jeuler.fitting.options import Options
+from jeuler.fitting.problem import Problem
+from jeuler.fitting.report import errors_of
 from jeuler.fitting.result import Fit
 
 

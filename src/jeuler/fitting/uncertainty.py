@@ -39,6 +39,12 @@ class Directions(NamedTuple):
     seen: Any
     left: Any
 
+    def null(self) -> np.ndarray:
+        """Directions of the parameters that change nothing, (n, k)."""
+        vectors = self.vectors[:, self.seen]
+        _, _, vt = np.linalg.svd(vectors.T, full_matrices=True)
+        return vt[vectors.shape[1] :].T / self.norms[:, None]
+
 
 class Uncertainty(NamedTuple):
     """What the residual and the Jacobian say about the errors.

@@ -1,0 +1,154 @@
+"""From where a search ended to a `Fit`: its errors, and what is to be said about it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler.fitting import least_squares
+from jeuler.fitting.blind import describe_blind
+from jeuler.fitting.least_squares import State
+from jeuler.fitting.losses import LOSSES
+from jeuler.fitting.minimise import Watch
+from jeuler.fitting.options import Known
+from jeuler.fitting.problem import Problem, series_of
+from jeuler.fitting.result import Fit, Verdict
+from jeuler.fitting.uncertainty import Uncertainty, directions, uncertainty
+from jeuler.fitting.unknowns import Layout, readable
+
+NOT_FINITE = (
+    "the residual is not finite at the start of the fit, nor at any point that was tried; "
+    "start closer, or use a smaller dt or a stabler step"
+)
+
+
+def ending(state: State, watch: Watch | None = None) -> str:
+    """How a search ended, in words."""
+    if watch is not None and watch.interrupted:
+        return "interrupted: the best so far"
+    if state.status in (least_squares.CONVERGED, least_squares.ROUNDED):
+        return "converged"
+    if state.status == least_squares.STALLED:
+        return (
+            "stopped before it converged: no step makes the residual smaller, though its gradient is not zero; "
+            "it jumps or is not finite near here, so use a smaller dt or start elsewhere"
+        )
+    return "stopped before it converged: allow more iterations or start closer"
+
+
+def report(
+    problem: Problem,
+    state: State,
+    history: list[float],
+    spread: float,
+    loss: str,
+    words: str,
+    known: Known,
+    starts: Any = None,
+) -> Fit:
+    """What was found, with its errors and what is to be said about it; ``words`` say how the search ended."""
+    layout, x = problem.layout, np.asarray(state.x)
+    size = max(int(np.sum(np.asarray(problem.weights) > 0)), 1)
+    total = float(state.total)
+    errors = _errors(problem, state, spread, loss)
+    held = ((x <= problem.lower) | (x >= problem.upper)) & (problem.lower < problem.upper)
+    rms = float(np.sqrt(total / max(size - len(x), 1)))
+    noise = 1.0 if problem.absolute else known.noise
+    quality: dict[str, Any] = {
+        "explained": 1 - total / known.variance if known.variance else None,
+        "noise_ratio": rms / noise if noise else None,
+        "autocorrelation": errors.autocorrelation,
+    }
+    verdict = Verdict(
+        ending=words,
+        nonfinite=int(state.nonfinite),
+        blind=errors.blind,
+        at_bound=tuple(np.asarray(layout.names(readable))[held]),
+        unresolved=errors.unresolved,
+        correlated=errors.correlated,
+        sigma_given=problem.absolute,
+        more=(*known.more, *_few(size, len(x)), *_kept(layout)),
+        **quality,
+    )
+    return Fit(
+        params=layout.params(jnp.asarray(x)),
+        loss=total / size,
+        history=np.asarray(history) / size,
+        stderr=errors.stderr,
+        covariance=errors.covariance,
+        converged=words == "converged",
+        message=verdict.message(),
+        undetermined=errors.undetermined,
+        nonfinite=int(state.nonfinite),
+        stderr_white=errors.white,
+        residual=problem.form.params(jnp.asarray(state.residual)),
+        blind=errors.blind,
+        at_bound=tuple(np.asarray(layout.names())[held]),
+        starts=starts,
+        **quality,
+    )
+
+
+class _Errors(NamedTuple):
+    """Standard errors and what the data do not determine, as a `Fit` has them; the defaults where none were found."""
+
+    stderr: Any = None
+    white: Any = None
+    covariance: Any = None
+    undetermined: tuple[str, ...] = ()
+    blind: tuple[str, ...] = ()
+    unresolved: tuple[str, ...] = ()  # positive parameters whose error is larger than their value
+    autocorrelation: float | None = None
+    correlated: bool = False
+
+
+def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors:
+    """The errors of a search with values in hand."""
+    if not (state.jacobian.size and np.isfinite(state.jacobian).all()):
+        return _Errors()
+    layout, x = problem.layout, np.asarray(state.x)
+    with np.errstate(all="ignore"):
+        found = errors_of(problem, state, spread, loss)
+        error, white = (
+            np.where(found.blind, np.inf, np.sqrt(np.maximum(np.diag(c), 0))) for c in (found.covariance, found.white)
+        )
+        null = directions(state.jacobian, problem.precision).null()
+        blind = describe_blind(null, x, layout.names(readable), np.asarray(problem.lower) >= 0)
+    doubtful = (problem.lower == 0) & (x > 0) & (error > x) & ~found.blind
+    return _Errors(
+        stderr=layout.params(jnp.asarray(error)),
+        white=layout.params(jnp.asarray(white)),
+        covariance=found.covariance,
+        undetermined=tuple(name for name, out in zip(layout.names(), found.blind, strict=True) if out),
+        blind=blind,
+        unresolved=tuple(np.asarray(layout.names(readable))[doubtful]),
+        autocorrelation=float(found.autocorrelation) if np.isfinite(found.autocorrelation) else None,
+        correlated=bool(np.any(found.covariance != found.white)),
+    )
+
+
+def _few(count: int, unknowns: int) -> tuple[str, ...]:
+    """A word where hardly more is known than is asked."""
+    if unknowns < count < 2 * unknowns:
+        return (f"there are only {count} data for {unknowns} parameters: the errors are guesses; record more",)
+    return ()
+
+
+def _kept(layout: Layout) -> tuple[str, ...]:
+    if not layout.kept:
+        return ()
+    return (f"{', '.join(layout.kept)} kept as given, an integer; write a float to fit it",)
+
+
+def errors_of(problem: Problem, state: State, spread: Any, loss: str) -> Uncertainty:
+    """Covariances at the end of a search; a robust loss counts an outlier by its influence."""
+    xp = least_squares.namespace(state.x)
+    _, slope = LOSSES[loss](state.residual / spread)
+    jacobian = state.jacobian / xp.where(slope > 0, slope, 1)[:, None]
+    curvature = LOSSES[loss].curvature(state.residual / spread)
+    influence = state.residual * slope**2
+    counted = problem.weights > 0
+    absolute = problem.absolute and loss == "linear"
+    return uncertainty(jacobian, influence, curvature, counted, series_of(problem.form), problem.precision, absolute)

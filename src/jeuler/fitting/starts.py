@@ -1,0 +1,99 @@
+"""Searches from many starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler._core import checks
+from jeuler.fitting import least_squares
+from jeuler.fitting.least_squares import Evaluate, State, Task, start
+from jeuler.fitting.losses import LOSSES, Loss
+from jeuler.fitting.minimise import Watch
+from jeuler.fitting.options import Options
+from jeuler.fitting.problem import JACOBIAN_BYTES, Problem
+from jeuler.fitting.report import NOT_FINITE
+
+
+def best_start(
+    problem: Problem, options: Options, evaluate: Evaluate, task: Task, x: np.ndarray, watch: Watch
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Where the best of many short searches ended, and all of them."""
+    layout, n, m = problem.layout, len(x), problem.form.size
+    if isinstance(options.starts, (int, np.integer)) and not isinstance(options.starts, bool):
+        xs = drawn_starts(checks.count("starts", options.starts, least=1), x, task, evaluate)
+    else:
+        count = len(jax.tree.leaves(options.starts)[0])
+        xs = np.stack(
+            [np.asarray(layout.vector(jax.tree.map(lambda a, k=k: a[k], options.starts)), float) for k in range(count)]
+        )
+        xs = np.clip(xs, task.lower, task.upper)
+    at_once = max(1, min(len(xs), JACOBIAN_BYTES // 4 // (8 * m * n)))
+    states = many_starts(
+        evaluate.both,
+        LOSSES["linear"],
+        xs,
+        task,
+        max_iterations=options.max_iterations,
+        watch=watch,
+        at_once=at_once,
+    )
+    size = max(int(np.sum(task.all_weights > 0)), 1)
+    losses = np.array([state.total / size for state in states])
+    if not np.isfinite(losses).any():
+        raise ValueError(NOT_FINITE)
+    every = jax.tree.map(lambda *a: jnp.stack(a), *[layout.params(jnp.asarray(s.x)) for s in states])
+    return states[int(np.nanargmin(losses))].x, {"params": every, "loss": losses}
+
+
+def drawn_starts(count: int, x: np.ndarray, task: Task, evaluate: Any) -> np.ndarray:
+    """Starts about the given one, which is the first: within bounds, a factor of ten, or what changes the residual."""
+    draw = np.random.default_rng(0)
+    with np.errstate(all="ignore"):
+        r, jacobian = evaluate.both(x, task.data)
+        norms = np.asarray(least_squares.column_norms(np.asarray(jacobian, float)))
+        reach = float(np.linalg.norm(np.asarray(r, float))) / norms
+    reach = np.where(np.isfinite(reach) & (reach > 0), reach, np.where(x != 0, np.abs(x), 1.0))
+    between = np.isfinite(task.lower) & np.isfinite(task.upper)
+    positive = (task.lower >= 0) & (x > 0) & ~between
+    xs = [x]
+    for _ in range(count - 1):
+        uniform = draw.uniform(size=len(x))
+        about = x + reach * draw.normal(size=len(x))
+        about = np.where(positive, x * 10 ** (2 * uniform - 1), about)
+        about = np.where(between, task.lower + uniform * (task.upper - task.lower), about)
+        xs.append(np.clip(about, task.lower, task.upper))
+    return np.stack(xs)
+
+
+def many_starts(
+    both: Callable[..., Any], loss: Loss, xs: np.ndarray, task: Task, *, max_iterations: int, watch: Watch, at_once: int
+) -> list[State]:
+    """A search from each of the starts; their residuals and Jacobians are evaluated ``at_once`` by one program."""
+    batched = jax.jit(jax.vmap(both, in_axes=(0, None)))
+    states = [start(x, len(task.weights), max_iterations) for x in xs]
+
+    def goes_on(state: State) -> bool:
+        return bool(state.status == least_squares.RUNNING and state.iterations < max_iterations)
+
+    while running := [k for k, state in enumerate(states) if goes_on(state)]:
+        for first in range(0, len(running), at_once):
+            some = running[first : first + at_once]
+            filled = [*some, *some[:1] * (at_once - len(some))]
+            trials = np.stack([states[k].trial for k in filled])
+            values, jacobians = (np.asarray(a, float) for a in batched(trials, task.data))
+            for place, k in enumerate(some):
+                known = _known(values[place], jacobians[place])
+                with np.errstate(all="ignore"):
+                    states[k] = least_squares.advance(known, loss, states[k], task, states[k].evaluations + 1)
+        watch.bar.update()
+    return states
+
+
+def _known(value: np.ndarray, jacobian: np.ndarray) -> Evaluate:
+    """An evaluation whose result is there already."""
+    return Evaluate(lambda x, data: value, lambda x, data: (value, jacobian))  # type: ignore[arg-type,return-value]
