@@ -113,3 +113,25 @@ def test_prescribed_paddle_is_not_pushed(mass):
 def test_surface_that_is_nan_is_announced():
     end = run(Collisions((lambda t, p: p[1] * jnp.nan,)), [[0.0, 3.0]], [[0.0, -5.0]], dt=0.1, num_steps=10)
     assert int(end.first_nonfinite) == 1
+
+
+def test_bounce_almost_along_a_floor_is_not_missed():
+    """A ball that falls by 0.07 mm in a step while it goes 7 mm along: it meets the floor at s = 0.497 and stays."""
+    floor = Collisions((FLOOR,), radius=0.1, restitution=0.5)
+    start = [[0.7, 0.1 + 6.7e-5]], [[-1.355, -0.0149]]
+    end = run(floor, *start, dt=0.005, num_steps=1, step=jeuler.rk4_step)
+    np.testing.assert_allclose(end.y.position[-1, 0], [0.7 - 1.355 * 0.005, 0.1], atol=1e-12)
+    np.testing.assert_allclose(end.y.velocity[-1, 0], [-1.355, 0], atol=1e-12)
+    assert int(end.unresolved_contacts) == 0
+
+
+def test_ball_that_is_hit_off_the_floor_falls_from_then_on():
+    """A ball at rest on the floor is hit from below its middle at half the step: then the floor holds it no longer."""
+    contact = Collisions((FLOOR,), pairs=[(0, 1)], radius=[0.1, 0.005], restitution=1.0)
+    way, half, g = np.array([0.8, 0.6]), 0.005, np.array([0.0, -9.8])
+    velocity = way - half * g  # so that it is ``way`` as they meet, with centres along it
+    meeting = np.array([0.0, 0.1]) - 0.105 * way
+    start = [[0.0, 0.1], meeting - half * velocity - half**2 / 2 * g], [[0.0, 0.0], velocity]
+    end = run(contact, *start, dt=2 * half, num_steps=1, step=jeuler.rk4_step)
+    np.testing.assert_allclose(end.y.velocity[-1, 0], way + half * g, atol=1e-12)
+    np.testing.assert_allclose(end.y.position[-1, 0], [0.8 * half, 0.1 + 0.6 * half - 4.9 * half**2], atol=1e-12)

@@ -45,6 +45,11 @@ class _Shape:
             elif not isinstance(value, bool):
                 store_as_float(self, name)
 
+    @property
+    def convex(self) -> bool:
+        """Whether the solid is convex and does not move, so that its distance along a straight path is convex."""
+        return not any(callable(value) for value in vars(self).values()) and not getattr(self, "inside", False)
+
     def check(self, dim: int) -> None:
         for name, value in vars(self).items():
             where = f"{type(self).__name__}.{name}"

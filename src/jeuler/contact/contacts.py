@@ -73,6 +73,11 @@ class Contacts:
         self.i, self.j = self.i[kept], self.j[kept]
         self.listed = jnp.arange(capacity) < number
 
+    def convex(self) -> Array:
+        """Where the gap is a convex function of the place of the first partner relative to the second."""
+        walls = np.repeat([getattr(collider, "convex", False) for collider in self.colliders], self.particles)
+        return jnp.concatenate([jnp.asarray(walls, bool), jnp.ones(len(self.i), bool)])
+
     def possible(self) -> Array:
         """Which contacts there are: alive, and something of it can move."""
         wall = jnp.tile(self.alive & (self.inverse_mass > 0), len(self.colliders))
@@ -154,7 +159,7 @@ class Contacts:
         n = self.particles
         parts = [self._look_at_collider(k, path, jnp.tile(path.s, k + 1)) for k in range(len(self.colliders))]
         gap, normal = (jnp.concatenate([getattr(part, name) for part in parts]) for name in ("gap", "normal"))
-        small = self.roundoff(path.x)
+        small = self.roundoff(path.x)[: self.walls]
         walls = [slice(k * n, (k + 1) * n) for k in range(len(self.colliders))]
         touching = (gap <= small)[:, None]
         for k, own in enumerate(walls):

@@ -14,9 +14,9 @@ from jax import Array, lax
 
 from jeuler._core.vectors import length
 from jeuler.contact.contacts import Contacts
-from jeuler.contact.paths import Path
+from jeuler.contact.paths import Path, along
 
-MAX_STRIDES = 100  # along one path; a path that grazes a surface needs many
+MAX_STRIDES = 400  # along one path; one that grazes a surface that is not known to be convex needs many
 NEWTON_STEPS = 5
 REFINEMENTS = 2  # of Newton's method from the root: derivatives of the root are right up to the third
 
@@ -36,6 +36,7 @@ class Found(NamedTuple):
     s: Array  # (contact,), inf for none
     at_root: Array
     plastic: Array
+    given_up: Array  # whether the search ended before it was clear
 
 
 def bounce(v: Array, normal: Array, restitution: Any, friction: Any) -> Array:
@@ -61,11 +62,24 @@ def impulsive_limit(contacts: Contacts, normal: Array, path: Path) -> Array:
     return 1.001 * made + rounding
 
 
+def convex_stride(gap: Array, slope: Array, bend: Array) -> Array:
+    """How far a gap that would be convex on a straight path is above 0 on one that bends by at most this much.
+
+    The root of  gap + slope h - bend h^2 / 2,  for gap and bend >= 0.
+    """
+    root = jnp.sqrt(slope**2 + 2 * bend * gap)
+    falls = slope < 0
+    down = 2 * gap / jnp.where(falls, root - slope, 1)
+    up = (root + slope) / jnp.where(bend > 0, bend, 1)
+    return jnp.where(falls, down, jnp.where(bend > 0, up, 2))
+
+
 def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     """The next impact of each contact along the paths as they are now.
 
-    Strides of the length of the gap, which cannot cross a surface (J. C. Hart, Sphere tracing, 1996), up to near it;
-    then Newton's method. Who touches and approaches is at an impact now; its root is close by, or in the past.
+    Strides of the length of the gap, which cannot cross a surface (J. C. Hart, Sphere tracing, 1996), or longer ones
+    where the solid is convex, up to near it; then Newton's method. Who touches and approaches is at an impact now; its
+    root is close by, or in the past.
     """
     start = contacts.both(jnp.maximum, path.s)
     small = contacts.roundoff(path.x)
@@ -74,9 +88,11 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     touching = first.gap <= small
     now = touching & (-first.slope > limit)
     lowest = jnp.where(now, start - 1, start)
-    fastest = length(first.speed) + length(contacts.relative(path.bend))
+    turn = length(contacts.relative(path.bend))
+    fastest = length(first.speed) + turn
     stride = fastest + jnp.abs(first.recession) * contacts.dt
     safe_stride = jnp.where(stride > 0, stride, 1)
+    convex = contacts.convex()
     searched = contacts.possible() & (now | (first.gap <= stride))
 
     def go_on(state):
@@ -87,6 +103,8 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
         s, gap, slope, apart, newtons, n = state
         far = apart & ((gap > 1e-3 * stride) | (slope >= 0)) & (gap > 0) & (newtons == 0)
         ahead = jnp.maximum(gap / safe_stride, jnp.where(slope >= 0, 0.02, 0))  # away from it not too slowly
+        longer = convex_stride(jnp.maximum(gap, 0), slope, turn)
+        ahead = jnp.minimum(jnp.where(convex, jnp.maximum(ahead, longer), ahead), 2)
         falls = slope < 0
         root = jnp.clip(s - gap / jnp.where(falls, slope, -1), lowest, 2)
         s = jnp.where(n == 0, s, jnp.where(far, s + ahead, jnp.where(falls, root, s)))
@@ -97,11 +115,12 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
 
     begin = start + jnp.where(touching & ~now, 1e-3, 0)  # who leaves may come back
     state = begin, first.gap, first.slope, now, jnp.zeros(contacts.count, jnp.int32), 0
-    s, gap, slope, apart, *_ = lax.while_loop(go_on, advance, state)
+    s, gap, slope, apart, newtons, _ = lax.while_loop(go_on, advance, state)
+    given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
     at_root = (slope < 0) & (jnp.abs(gap) <= small + 1e-6 * stride) & (s > lowest)
     happens = searched & (now | (apart & at_root & (s <= 1)))
     s = jnp.where(now & ~at_root, start, s)
-    return Found(jnp.where(happens, s, jnp.inf), at_root, ~now & (-slope <= limit))
+    return Found(jnp.where(happens, s, jnp.inf), at_root, ~now & (-slope <= limit), given_up)
 
 
 def choose(contacts: Contacts, found: Found) -> Events:
@@ -164,14 +183,25 @@ def apply(contacts: Contacts, path: Path, events: Events, theta: Array, refineme
     own_s = spread(contacts, path.s, s, met)
     hit = (events.contact >= 0)[:, None]
     late = (1 - own_s)[:, None] + 0.5 - theta
+    speed = jnp.where(hit, path.speed(own_s) + contacts.dt * kick, path.way)
+    hold = hold - jnp.where(hit & leaves_its_support(path, own_s, speed), path.support, 0)
     return Path(
         own_s,
         jnp.where(hit, path.position(own_s), path.x),
-        jnp.where(hit, path.speed(own_s) + contacts.dt * kick, path.way),
+        speed,
         path.bend + hold,
         path.jump + kick + late * hold / contacts.dt,
         path.hit | hit[:, 0],
+        path.support + hold,
+        jnp.where(jnp.any(hold != 0, axis=-1), along(speed, path.support + hold), path.ride),
     )
+
+
+def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:
+    """Whether a particle with this dx/ds at s goes off what held it and does not fall back in this step."""
+    falls_back = 0.5 * (1 - s) * length(path.support)
+    rounding = 16 * jnp.finfo(s.dtype).eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1))
+    return (along(speed, path.support) - path.ride > falls_back + rounding)[:, None]
 
 
 def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Array:
@@ -195,12 +225,13 @@ def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: 
     record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds + 1, *x.shape)), empty)
 
     def one(state):
-        path, record, k, _, _ = state
+        path, record, k, _, left = state
         found = next_impacts(contacts, path, slow)
         events = choose(contacts, found)
         events = events._replace(plastic=events.plastic | (k == rounds))
         any_left = jnp.any(events.contact >= 0)
-        left = jnp.where(k == rounds, jnp.sum(jnp.isfinite(found.s) & ~found.plastic), 0).astype(jnp.int32)
+        stopped = (k == rounds) & jnp.isfinite(found.s) & ~found.plastic
+        left = left + jnp.sum(found.given_up | stopped).astype(jnp.int32)
         record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)
         return apply(contacts, path, events, theta), record, k + 1, any_left, left
 

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jeuler._core.vectors import unit
+
 
 class Path(NamedTuple):
     """Where each particle is in parts s from 0 to 1 of a step of length dt, after its last impact.
@@ -28,6 +30,8 @@ class Path(NamedTuple):
     bend: Array  # (particle, dim), m
     jump: Array  # (particle, dim), what impacts added to the velocity, m/s
     hit: Array  # (particle,), whether there was an impact
+    support: Array  # (particle, dim), what of bend are forces of contacts that it stays in, m
+    ride: Array  # (particle,), dx/ds along the support while it stays, m a step
 
     def position(self, s: Array) -> Array:
         part = (s - self.s)[:, None]
@@ -38,10 +42,16 @@ class Path(NamedTuple):
         return self.way + (s - self.s)[:, None] * self.bend
 
 
-def free_path(x: Array, displacement: Array, dv: Array, dt: Any) -> Path:
-    """The path of a step without impacts."""
-    zero, bend = jnp.zeros(len(x), x.dtype), dt * dv
-    return Path(zero, x, displacement - bend / 2, bend, jnp.zeros_like(x), zero > 0)
+def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = 0.0) -> Path:
+    """The path of a step without impacts; ``kick`` is what of dv contacts give that last through the step."""
+    zero, bend, support = jnp.zeros(len(x), x.dtype), dt * dv, jnp.zeros_like(x) + dt * kick
+    way = displacement - bend / 2
+    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, along(way + bend, support))
+
+
+def along(y: Array, support: Array) -> Array:
+    """The component of y along the support, (particle,)."""
+    return jnp.sum(y * unit(support), axis=-1)
 
 
 def share_of_the_force(displacement: Array, v: Array, dv: Array, dt: Any) -> Array:

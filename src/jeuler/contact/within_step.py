@@ -65,7 +65,7 @@ def hold(
 
     kick, shift, on, unresolved = lax.cond(jnp.any(stays), held, free, None)
     touched = _is_touched(contacts, on)
-    path = free_path(x + shift, displacement + theta * contacts.dt * kick, dv + kick, contacts.dt)
+    path = free_path(x + shift, displacement + theta * contacts.dt * kick, dv + kick, contacts.dt, kick)
     return path, v + dv + kick, touched, unresolved
 
 
