@@ -66,6 +66,7 @@ RESULTS = {
     "Fit": lambda: jeuler.fit(line, {"slope": 1.0, "unused": 2.0}, max_iterations=3),
     "SpringFit": spring_fit,
     "Identifiability": lambda: jeuler.identifiability(*hanging(), np.linspace(0.0, 0.3, 7), ("ks",), dt=0.05),
+    "Method": lambda: jeuler.Method(jeuler.rk4_step, dts=(0.1, 0.2), options={"breaks": (0.5,)}),
     "WorkPrecision": lambda: jeuler.work_precision(
         decay, 1.0, t1=1.0, dts=[0.5, 0.25], steps={"Euler": jeuler.euler_step}, reference=np.exp, repeats=1
     ),

@@ -10,7 +10,7 @@ from jeuler import effects as effects
 from jeuler import forces as forces
 from jeuler import samplers as samplers
 from jeuler import steps as steps
-from jeuler.accuracy import Compensated, StepAdvice, WorkPrecision, advise_step, work_precision
+from jeuler.accuracy import Compensated, Method, StepAdvice, WorkPrecision, advise_step, work_precision
 from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
 from jeuler.diagnosis import Diagnosis, diagnose
 from jeuler.effects import (
@@ -95,6 +95,7 @@ __all__ = [
     "Identifiability",
     "Lifetime",
     "LinearDrag",
+    "Method",
     "Normal",
     "OverLife",
     "ParticleState",

@@ -2,11 +2,12 @@
 
 from jeuler.accuracy._work_precision import work_precision
 from jeuler.accuracy.advice import StepAdvice, advise_step
-from jeuler.accuracy.runs import Compensated
+from jeuler.accuracy.method import Compensated, Method
 from jeuler.accuracy.table import WorkPrecision
 
 __all__ = [
     "Compensated",
+    "Method",
     "StepAdvice",
     "WorkPrecision",
     "advise_step",

@@ -1,4 +1,4 @@
-"""work_precision: what accuracy costs in time, for any methods on one problem."""
+"""work_precision: what accuracy costs in time and in evaluations, for any methods on one problem."""
 
 from __future__ import annotations
 
@@ -12,28 +12,14 @@ import numpy as np
 from jeuler._core import checks, trees
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.partition import arrays_only, is_parameter
-from jeuler._core.precision import cast, double_precision, flat, flat_rows, precision
-from jeuler.accuracy.reference import (
-    Reference,
-    ReferenceGradient,
-    error_norms,
-    make_reference,
-    make_reference_gradient,
-)
-from jeuler.accuracy.runs import (
-    AdaptiveRun,
-    Compensated,
-    FixedRun,
-    evaluations,
-    fixed_grid,
-    is_adaptive,
-    is_diffrax,
-    named,
-)
+from jeuler._core.precision import cast, double_precision, precision
+from jeuler.accuracy.method import is_diffrax, named
+from jeuler.accuracy.plan import Plan, make_plans
+from jeuler.accuracy.reference import Norm, distinct, make_reference, make_reference_gradient
+from jeuler.accuracy.sweep import Sweep, thinned
 from jeuler.accuracy.table import EMPTY_ROW, WorkPrecision, mark_pareto
-from jeuler.accuracy.timing import measure
 from jeuler.steps.explicit import VectorField
-from jeuler.steps.stability import stability_limit
+from jeuler.steps.stability import Linearisation
 
 PyTree = Any
 
@@ -50,20 +36,26 @@ def work_precision(
     t0: float = 0.0,
     args: PyTree = None,
     dtypes: Sequence[Any] | None = None,
-    tolerances: Sequence[float] | np.ndarray = (),
+    tolerances: Sequence[Any] | np.ndarray = (),
+    norm: Callable[[PyTree], Any] | None = None,
+    points: int = 64,
     gradient: Callable[[PyTree], jax.Array] | None = None,
     repeats: int = 5,
     timeout: float = 30.0,
     adjoint: Any = None,
+    problem: str = "",
     progress: bool | None = None,
 ) -> WorkPrecision:
-    """Error against seconds for each method and each step size, on one problem.
+    """Error against seconds and evaluations for each method and each step size, on one problem.
 
-        error(dt) = |y_dt(t) - y(t)|,  at t1, at its largest, and as a root mean square over the saved times
+        error(dt) = |y_dt(t) - y(t)|,  at t1, at its largest, and as a root mean square over the run
 
-    The steps are equal: each dt becomes the nearest one that divides t1 - t0. Every program is compiled ahead (compile
-    seconds apart), run once unmeasured, then measured ``repeats`` times. A run that blows up, or that would take longer
-    than ``timeout`` by the speed of the coarser ones before it, is a row of NaN with its reason.
+    The steps are equal: each dt becomes the nearest one that divides t1 - t0. One program serves all step sizes of a
+    method, and one all its tolerances; a gradient has one for each row. Each is compiled ahead (compile seconds apart),
+    run once unmeasured, then measured ``repeats`` times. A run that blows up, or that would take longer than
+    ``timeout`` by the speed of its first steps, is a row of NaN with its reason.
+
+    To add a method later, or put several problems in one table, add tables: ``table + work_precision(...)``.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
@@ -71,19 +63,25 @@ def work_precision(
       t1: final time, s.
       dts: step sizes, s.
       steps: ``{name: method}``, or a sequence of steps. A method is a step ``(f, t, y, dt, args) -> y``, such a step
-        with compensated sums, ``Compensated(euler_step)``, or a diffrax solver.
+        with compensated sums, ``Compensated(euler_step)``, a diffrax solver, or one of these with its own step sizes,
+        tolerances and options, a `Method`.
       reference: the exact solution, a function of t; or the state at t1; or a diffrax solver, run at tight
         tolerance (take a stiff one for a stiff problem); None runs ``diffrax.Dopri8``. Always in float64.
       t0: initial time, s.
       args: passed to f.
       dtypes: precisions to run in, such as ("float32", "float64"); None takes that of y0.
-      tolerances: for methods that choose their own steps, adaptive diffrax solvers and `extrapolated_euler`,
-        further rows at these tolerances, relative and absolute alike; no fixed dt.
+      tolerances: for methods that choose their own steps, adaptive diffrax solvers and `extrapolated_euler`, further
+        rows at these tolerances: pairs (rtol, atol), or numbers for both alike.
+      norm: a function of a difference of states, of the form of y0, that returns its size; None takes the Euclidean
+        norm over all numbers of the state.
+      points: states of a run that are compared, evenly over time, for its largest and mean error: ends of steps, or
+        where a diffrax solver chooses its own steps what it interpolates.
       gradient: a scalar function of the final state; each row then also has the error, seconds and bytes of its
         reverse-mode derivative with respect to args.
       repeats: measured runs in each row.
       timeout: longest run allowed, s.
       adjoint: how diffrax differentiates, a ``diffrax.AbstractAdjoint``; None takes its default.
+      problem: a name for the problem, to tell it from others in one table.
       progress: show a bar; None shows it on a terminal once the sweep has lasted two seconds.
     Returns: `WorkPrecision`.
     Raises: ValueError, before anything runs, naming the argument, what was expected and what came.
@@ -104,131 +102,65 @@ def work_precision(
     checks.untraced("work_precision", y0, args, t0, t1)
     f, args = arrays_only(f, args, is_parameter)
     t0, t1 = checks.interval(t0, t1)
-    dts = _positive_values("dts", dts, "s")
-    if not dts:
-        raise ValueError("dts must name at least one step size, got none")
-    if max(dts) > 1.5 * (t1 - t0):
-        raise ValueError(f"each of dts must be below t1 - t0 = {t1 - t0:g} s, got {max(dts):g} s; take smaller ones")
-    tolerances = _positive_values("tolerances", tolerances)
-    repeats = checks.count("repeats", repeats, least=1)
+    if not isinstance(problem, str):
+        raise ValueError(f"problem must be a string, the name of the problem, got {checks.shown(problem)}")
+    repeats, points = checks.count("repeats", repeats, least=1), checks.count("points", points, least=1)
     checks.positive("timeout", timeout, "s")
-    methods = named(steps)
-    dtypes = [np.dtype(d) for d in ([trees.time_dtype(y0)] if dtypes is None else dtypes)]
-    if any(d not in (np.float32, np.float64) for d in dtypes):
-        raise ValueError(f"dtypes must be float32 or float64, got {[str(d) for d in dtypes]}")
+    plans = make_plans(named(steps), dts, tolerances, t0, t1, points)
+    dtypes = checked_dtypes(dtypes, y0)
+    sweep = Sweep(f, t0, t1, points, repeats, timeout, gradient, adjoint)
     with double_precision():
         y64, args64 = cast(y0, np.float64), cast(args, np.float64)
         checks.vector_field(f, t0, y64, args64)
-        plans = {name: _plan(method, t0, t1, dts, tolerances) for name, method in methods.items()}
-        times = np.unique(np.concatenate([run.times for plan in plans.values() for run in plan]).round(15))
-        times = times[np.append(True, np.diff(times) > 1e-9 * (t1 - t0))]
-        truth = make_reference(reference, f, y64, args64, times)
+        size = None if norm is None else Norm(norm, y64)
+        limits = stability_limits(plans, f, t0, y0, args)
+    counts = {}
+    for dtype in dtypes:
+        with precision(dtype):
+            counts[dtype] = [sweep.count(plan, cast(y0, dtype), cast(args, dtype)) for plan in plans]
+    with double_precision():
+        looked_at = [t0, t1, *sweep.moments, *(t for plan in plans for run in plan.fixed for t in run.times)]
+        looked_at += [t for of in counts.values() for plan in of for count in plan for t in thinned(count, points)[0]]
+        truth = make_reference(reference, f, y64, args64, distinct(np.array(looked_at), t0, t1), size)
         slope = None
         if gradient is not None:
             slope = make_reference_gradient(gradient, reference, f, y64, args64, t0, t1)
-        counts = {name: evaluations(plan, f, y64, args64) for name, plan in plans.items()}
-        limits = {name: _limit(method, f, t0, y0, args) for name, method in methods.items()}
 
     rows: list[dict[str, Any]] = []
-    total = len(dtypes) * sum(len(plan) for plan in plans.values())
+    same = {"problem": problem, "t0": t0, "t1": t1, "reference_error": truth.error}
+    total = len(dtypes) * sum(len(plan.runs) for plan in plans)
     with tqdm(total=total, delay=2, disable=None if progress is None else not progress, unit="run") as bar:
         for dtype in dtypes:
             with precision(dtype):
-                problem = f, cast(y0, dtype), cast(args, dtype)
-                for name, plan in plans.items():
-                    pace = 0.0  # seconds a step of the run before, coarser
-                    for run, count in zip(plan, counts[name], strict=True):
-                        bar.set_postfix_str(f"{name} {dtype}")
-                        row = EMPTY_ROW | {"method": name, "dtype": str(dtype)}
-                        row |= _row(run, problem, truth, pace, repeats, timeout)
-                        row["evaluations"] = count(row["num_steps"]) if row["num_steps"] > 0 else -1
-                        if slope is not None and not row["reason"]:
-                            row |= _gradient_row(run, problem, gradient, slope, repeats, timeout, adjoint)
-                        if isinstance(run, FixedRun) and math.isfinite(row["run_seconds_min"]):
-                            pace = row["run_seconds_min"] / run.num_steps
-                        rows.append(row)
+                inputs = cast(y0, dtype), cast(args, dtype)
+                for plan, of_plan, limit in zip(plans, counts[dtype], limits, strict=True):
+                    bar.set_postfix_str(f"{plan.name} {dtype}")
+                    whose = {"method": plan.name, "dtype": str(dtype), "stability_limit": limit}
+                    for row in sweep.rows(plan, inputs, of_plan, truth, slope, size):
+                        rows.append(EMPTY_ROW | same | whose | row)
                         bar.update()
-    mark_pareto(rows, truth.error)
-    return WorkPrecision(rows=rows, stability_limits=limits, reference_error=truth.error, interval=(t0, t1))
+    mark_pareto(rows)
+    return WorkPrecision(rows=rows)
 
 
-def _plan(method: Any, t0: float, t1: float, dts: list[float], tolerances: list[float]) -> list[FixedRun | AdaptiveRun]:
-    """The runs of a method from coarse to fine, each grid once."""
-    fixed = {run.num_steps: run for run in (fixed_grid(method, t0, t1, dt) for dt in sorted(dts, reverse=True))}
-    loose_first = sorted(tolerances, reverse=True) if is_adaptive(method) else []
-    return [*fixed.values(), *(AdaptiveRun(method, t0, t1, tolerance) for tolerance in loose_first)]
+def stability_limits(plans: list[Plan], f: VectorField, t0: float, y0: PyTree, args: PyTree) -> list[float]:
+    """That of each plan's step at the start; NaN for a diffrax solver, whose step is not ours to call."""
+    linear = Linearisation(f, y0, args)
+
+    def limit(step: Any) -> float:
+        if is_diffrax(step):
+            return math.nan
+        try:
+            return float(linear.limit(t0, linear.flat, step, growing="skip"))
+        except (ValueError, TypeError, np.linalg.LinAlgError):  # a Jacobian that is not finite, a step not linear
+            return math.nan
+
+    return [limit(plan.method.step) for plan in plans]
 
 
-def _row(run, problem, truth: Reference, pace: float, repeats: int, timeout: float) -> dict[str, Any]:
-    f, y0, args = problem
-    if isinstance(run, AdaptiveRun):
-        row = {"tolerance": run.tolerance}
-    else:
-        row = {"dt": run.dt, "num_steps": run.num_steps}
-        if pace * run.num_steps > timeout:
-            return row | {"reason": f"would take {pace * run.num_steps:.3g} s, more than timeout={timeout:g} s"}
-    try:
-        cost = measure(lambda y0, args: run(f, y0, args), y0, args, repeats=repeats, patience=timeout)
-    except RuntimeError as failure:  # what an implicit solve raises at run time
-        return row | {"reason": str(failure).strip().splitlines()[0][:200]}
-    states, lost, num_steps = cost.result
-    row |= {
-        "num_steps": int(num_steps),
-        "compile_seconds": cost.compile_seconds,
-        "run_seconds": cost.run_seconds,
-        "run_seconds_min": cost.least,
-        "run_seconds_median": cost.median,
-    }
-    if cost.least > timeout:
-        return row | {"reason": f"took {cost.least:.3g} s, more than timeout={timeout:g} s"}
-    states = flat_rows(states)
-    if int(lost) >= 0 or not np.all(np.isfinite(states)):
-        at = f"at step {int(lost)}" if int(lost) >= 0 else "at the end"
-        return row | {"reason": f"blew up: not finite {at} of {int(num_steps)}"}
-    return row | error_norms(states, truth.at(run.times))
-
-
-def _gradient_row(run, problem, scalar, truth: ReferenceGradient, repeats, timeout, adjoint) -> dict[str, Any]:
-    f, y0, args = problem
-
-    def final(args):
-        return scalar(jax.tree.map(lambda leaf: leaf[-1], run(f, y0, args, adjoint)[0]))
-
-    cost = measure(jax.grad(final), args, repeats=repeats, patience=timeout)
-    error, size = float(np.linalg.norm(flat(cost.result) - truth.value)), float(np.linalg.norm(truth.value))
-    return {
-        "gradient_error": error,
-        "gradient_error_relative": error / size if size else math.nan,
-        "gradient_compile_seconds": cost.compile_seconds,
-        "gradient_seconds": cost.run_seconds,
-        "gradient_seconds_min": cost.least,
-        "gradient_seconds_median": cost.median,
-        "gradient_bytes": cost.temporary_bytes,
-    }
-
-
-def _limit(method: Any, f: VectorField, t0: float, y0: PyTree, args: PyTree) -> float:
-    """The stability limit at the start; NaN for a diffrax solver, whose step is not ours to call."""
-    if is_diffrax(method):
-        return math.nan
-    step = method.step if isinstance(method, Compensated) else method
-    try:
-        return stability_limit(f, t0, y0, args, step=step, growing="skip")
-    except (
-        ValueError,
-        TypeError,
-        np.linalg.LinAlgError,
-    ):  # a Jacobian that is not finite, a step that is not linear
-        return math.nan
-
-
-def _positive_values(name: str, values: Any, unit: str = "") -> list[float]:
-    try:
-        if isinstance(values, str) or np.ndim(values) > 1:
-            raise TypeError
-        values = np.atleast_1d(np.asarray(values)).tolist()
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a list of numbers above 0, got {checks.shown(values)}") from None
-    for value in values:
-        checks.positive(f"each of {name}", value, unit)
-    return values
+def checked_dtypes(dtypes: Any, y0: PyTree) -> list[np.dtype]:
+    """The precisions to run in, or one ValueError."""
+    found = [np.dtype(d) for d in ([trees.time_dtype(y0)] if dtypes is None else dtypes)]
+    if any(d not in (np.float32, np.float64) for d in found):
+        raise ValueError(f"dtypes must be float32 or float64, got {[str(d) for d in found]}")
+    return found

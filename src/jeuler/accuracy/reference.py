@@ -10,11 +10,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeuler._core.precision import flat, flat_rows
+from jeuler._core import checks, trees
+from jeuler._core.precision import double_precision, flat, flat_rows
 from jeuler.steps.explicit import VectorField
 
 PyTree = Any
 TOLERANCES = 1e-11, 1e-13  # relative and, times the size of y0, absolute; the second is the reference
+
+
+class Norm:
+    """A norm of the person's own, of a state or a difference of states given as its numbers."""
+
+    def __init__(self, norm: Callable[[PyTree], Any], y0: PyTree) -> None:
+        self.norm, (vector, self.unflatten) = norm, trees.real_vector(y0)
+        checks.function("norm", norm, "(y) -> a number", "it is called with a difference of states, of the form of y0")
+        self(np.asarray(vector))
+
+    def __call__(self, numbers: np.ndarray) -> float:
+        with double_precision():
+            size = np.asarray(self.norm(self.unflatten(jnp.asarray(numbers))))
+        if size.shape or size.dtype.kind not in "iuf" or size < 0:
+            raise ValueError(f"norm must return one number that is at least 0, got {checks.shown(size)}")
+        return float(size)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +39,7 @@ class Reference:
     """States to compare with.
 
     Attributes:
-      times: (time,), s.
+      times: (time,), s, rising.
       states: (time, number), the numbers of y in one row each; NaN where nothing is known.
       error: how far the states may be trusted: the norm of the last one's change from the looser tolerance; 0.0 for an
         exact or a given reference.
@@ -33,16 +50,29 @@ class Reference:
     error: float
 
     def at(self, times: np.ndarray) -> np.ndarray:
-        return self.states[np.searchsorted(self.times, times - 1e-9 * (self.times[-1] - self.times[0]))]
+        return self.states[np.searchsorted(self.times, times, side="right") - 1]
 
 
-def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, times: np.ndarray) -> Reference:
+def distinct(times: np.ndarray, t0: float, t1: float) -> np.ndarray:
+    """The times, sorted, those that are the same but for roundoff once: the least of them."""
+    same = 1e-12 * (t1 - t0) + 8 * np.finfo(float).eps * max(abs(t0), abs(t1))
+    kept = [-np.inf]
+    for t in np.unique(times).tolist():
+        if t - kept[-1] > same:
+            kept.append(t)
+    return np.array(kept[1:])
+
+
+def make_reference(
+    reference: Any, f: VectorField, y0: PyTree, args: PyTree, times: np.ndarray, norm: Norm | None = None
+) -> Reference:
     """The reference at sorted times; y0 and args in float64.
 
     reference: a function of t, the state at the last time, a diffrax solver, or None for ``diffrax.Dopri8``.
     """
     import diffrax
 
+    size = norm or np.linalg.norm
     if reference is None or isinstance(reference, diffrax.AbstractSolver):
         solver = diffrax.Dopri8() if reference is None else reference
         run = jax.jit(lambda tolerance: accurate(f, y0, args, times, solver, tolerance))
@@ -53,7 +83,7 @@ def make_reference(reference: Any, f: VectorField, y0: PyTree, args: PyTree, tim
                 f"{TOLERANCES[1]}; give an exact solution as a function of t, or a stiff solver such as "
                 "diffrax.Kvaerno5()"
             )
-        return Reference(times, tight, float(np.linalg.norm(tight[-1] - loose[-1])))
+        return Reference(times, tight, float(size(tight[-1] - loose[-1])))
     if callable(reference):
         states = np.stack([flat(reference(t)) for t in times])
     else:
@@ -115,11 +145,16 @@ def make_reference_gradient(
     return ReferenceGradient(tight, float(np.linalg.norm(tight - loose)))
 
 
-def error_norms(states: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Euclidean norms of the error over all numbers of the state: at the end, largest, and root mean square in time."""
-    error, size = np.linalg.norm(states - reference, axis=1), np.linalg.norm(reference, axis=1)
-    weights = np.ones(len(error))
-    weights[[0, -1]] = 0.5  # the trapezoidal rule on even times
+def error_norms(
+    states: np.ndarray, reference: np.ndarray, times: np.ndarray, norm: Norm | None = None
+) -> dict[str, float]:
+    """Norms of the error, over all numbers of the state where none is given: at the end, largest, and rms in time."""
+    error, size = (
+        np.linalg.norm(rows, axis=1) if norm is None else np.array([norm(row) for row in rows])
+        for rows in (states - reference, reference)
+    )
+    spans = np.diff(times)
+    weights = (np.append(spans, 0) + np.append(0, spans)) / 2  # the trapezoidal rule
     mean_square = lambda x: float(np.sqrt(np.sum(weights * x**2) / np.sum(weights)))  # noqa: E731
     absolute = {"final": float(error[-1]), "max": float(error.max()), "l2": mean_square(error)}
     scale = {"final": float(size[-1]), "max": float(size.max()), "l2": mean_square(size)}

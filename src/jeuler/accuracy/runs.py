@@ -1,9 +1,9 @@
-"""What may stand in a work-precision table, each as one function from (y0, args) to the states at given times."""
+"""The runs of one method: a program for all numbers of steps, one for all tolerances, and their gradients."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,154 +11,159 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import trees
-from jeuler._core.component import result
-from jeuler.accuracy.timing import counting
+from jeuler.accuracy.method import Method, is_diffrax
 from jeuler.solving._adaptive import solve_adaptive
-from jeuler.solving._scan import solve
-from jeuler.steps.explicit import Step, VectorField
-from jeuler.steps.extrapolated import ExtrapolatedStep
+from jeuler.solving._scan import solve, solve_to
+from jeuler.solving.grid import COUNTER
+from jeuler.steps.explicit import VectorField
 
 PyTree = Any
-MOST_SAVED = 64  # states kept of a run, beside the first
 MOST_ADAPTIVE_STEPS = 100_000
-
-
-@result
-class Compensated:
-    """A step to be summed with compensation; in the ``steps`` of `work_precision` only.
-
-    Args:
-      step: an explicit step.
-    Raises: ValueError, in `work_precision`, if the step has no increment.
-    Example:
-      >>> import jeuler
-      >>> jeuler.Compensated(jeuler.euler_step).step is jeuler.euler_step
-      True
-
-    Source: A. Neumaier, Rundungsfehleranalyse einiger Verfahren zur Summation endlicher Summen, 1974.
-    """
-
-    step: Step
-
-
-def is_diffrax(method: Any) -> bool:
-    import diffrax
-
-    return isinstance(method, diffrax.AbstractSolver)
-
-
-def is_adaptive(method: Any) -> bool:
-    """Whether the method can choose its own steps from a tolerance."""
-    if isinstance(method, ExtrapolatedStep):
-        return method.order > 1
-    if is_diffrax(method):
-        import diffrax
-
-        return isinstance(method, diffrax.AbstractAdaptiveSolver)
-    return False
-
-
-def named(steps: Any) -> dict[str, Any]:
-    """``steps`` as a dictionary: a mapping as it is, a sequence by the names of its functions."""
-    if isinstance(steps, Mapping):
-        methods = dict(steps)
-    else:
-        if isinstance(steps, str) or not (callable(steps) or is_diffrax(steps) or isinstance(steps, Iterable)):
-            raise ValueError(f"steps must be a list of steps or a dict {{name: step}}, got {steps!r}")
-        steps = [steps] if callable(steps) or is_diffrax(steps) else list(steps)
-        methods = {getattr(s, "__name__", type(s).__name__).removesuffix("_step"): s for s in steps}
-        if len(methods) < len(steps):
-            raise ValueError("steps given as a list must have different names; pass a dict {name: step}")
-    for name, method in methods.items():
-        inner = method.step if isinstance(method, Compensated) else method
-        if not (callable(inner) or is_diffrax(inner)):
-            raise ValueError(
-                f"steps[{name!r}] must be a step (f, t, y, dt, args) -> y or a diffrax solver, got {method!r}"
-            )
-    if not methods:
-        raise ValueError("steps must name at least one method, got none")
-    return methods
+Program = Callable[..., tuple[PyTree, jax.Array, jax.Array]]  # states, first non-finite step (-1 none), steps taken
 
 
 @dataclasses.dataclass(frozen=True)
 class FixedRun:
-    """num_steps equal steps of a method from t0."""
+    """num_steps equal steps from t0, whose states are looked at after some of them."""
 
-    method: Any
     t0: float
-    dt: Any
+    dt: float
     num_steps: int
+    points: int
 
     @property
-    def saved(self) -> int:
-        """How many states are kept: the largest divisor of num_steps up to `MOST_SAVED`."""
-        return max(d for d in range(1, MOST_SAVED + 1) if self.num_steps % d == 0)
+    def ends(self) -> np.ndarray:
+        """After how many steps: evenly, or as evenly as steps allow where half of the points cannot be had so."""
+        even = max(d for d in range(1, self.points + 1) if self.num_steps % d == 0)
+        count = even if even >= self.points / 2 else min(self.points, self.num_steps)
+        return np.round(np.arange(1, count + 1) * (self.num_steps / count)).astype(np.int64)
 
     @property
-    def times(self) -> Any:
-        """The times of the states kept."""
-        return self.t0 + self.num_steps * self.dt * (np.arange(self.saved + 1) / self.saved)
+    def times(self) -> np.ndarray:
+        """t0, and the times of the states looked at."""
+        return self.t0 + self.dt * np.append(0, self.ends)
 
-    def __call__(
-        self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None
-    ) -> tuple[PyTree, jax.Array, jax.Array]:
-        """States at the times, first non-finite step (-1 none), steps taken."""
-        if is_diffrax(self.method):
-            import diffrax
+    def inputs(self, dtype: Any, most: int, first: int | None = None) -> tuple[jax.Array, jax.Array]:
+        """What `fixed_program` takes: dt and as many ends for each run; of the first steps only, where that is asked.
 
-            times = jnp.asarray(self.times, trees.time_dtype(y0))
-            equal, most = diffrax.ConstantStepSize(), self.num_steps + 8
-            return _diffrax(f, y0, args, self.method, times, self.dt, equal, most, adjoint)
-        compensated = isinstance(self.method, Compensated)
-        run = solve(
-            f,
-            y0,
-            dt=self.dt,
-            num_steps=self.num_steps,
-            t0=self.t0,
-            args=args,
-            step=self.method.step if compensated else self.method,
-            save_every=self.num_steps // self.saved,
-            compensated=compensated,
-        )
-        return run.y, run.first_nonfinite, jnp.int32(self.num_steps)
+        most: the largest number of steps among the runs that share the program.
+        """
+        ends = np.append(self.ends, np.full(self.points - self.ends.size, self.num_steps))
+        counter = jnp.int32 if most <= COUNTER else jnp.int64
+        return jnp.asarray(self.dt, dtype), jnp.asarray(np.minimum(ends, first or self.num_steps), counter)
 
 
 @dataclasses.dataclass(frozen=True)
 class AdaptiveRun:
     """A run that chooses its steps by a tolerance, relative and absolute."""
 
-    method: Any
-    t0: float
-    t1: float
-    tolerance: Any
+    rtol: float
+    atol: float
 
-    @property
-    def times(self) -> np.ndarray:
-        return np.array([self.t0, self.t1])
 
-    def __call__(
-        self, f: VectorField, y0: PyTree, args: PyTree, adjoint: Any = None
-    ) -> tuple[PyTree, jax.Array, jax.Array]:
-        if isinstance(self.method, ExtrapolatedStep):
-            run = solve_adaptive(
+def fixed_grid(t0: float, t1: float, dt: float, points: int) -> FixedRun:
+    """The run whose dt is nearest to the one asked for and divides the interval."""
+    num_steps = max(1, round((t1 - t0) / dt))
+    return FixedRun(t0, (t1 - t0) / num_steps, num_steps, points)
+
+
+def fixed_program(method: Method, f: VectorField, t0: float, most: int) -> Program:
+    """``run(y0, args, dt, ends)``: y0 and the states after these numbers of steps; one program for all of a method.
+
+    most: the largest number of steps.
+    """
+    options = dict(method.options)
+
+    def run(y0, args, dt, ends):
+        if is_diffrax(method.step):
+            import diffrax
+
+            times = jnp.asarray(t0, dt.dtype) + dt * jnp.append(0, ends).astype(dt.dtype)
+            equal = diffrax.ConstantStepSize()
+            return _diffrax(f, y0, args, method.step, times, dt, equal, min(most, COUNTER - 8) + 8, None)
+        states, lost = solve_to(
+            f,
+            y0,
+            dt=dt,
+            ends=ends,
+            t0=t0,
+            args=args,
+            step=method.step,
+            compensated=method.compensated,
+            breaks=options.get("breaks", ()),
+        )
+        return states, lost, ends[-1]
+
+    return run
+
+
+def adaptive_program(method: Method, f: VectorField, times: np.ndarray, adjoint: Any = None) -> Program:
+    """``run(y0, args, rtol, atol)``: states at the times by the method's own steps; one program for all tolerances.
+
+    Between steps a diffrax solver interpolates; an extrapolated step is looked at t0 and t1 alone.
+    """
+    options = dict(method.options)
+    most = options.get("max_steps", MOST_ADAPTIVE_STEPS)
+
+    def run(y0, args, rtol, atol):
+        if is_diffrax(method.step):
+            import diffrax
+
+            make = options.get("controller", lambda rtol, atol: diffrax.PIDController(rtol=rtol, atol=atol))
+            moments = jnp.asarray(times, trees.time_dtype(y0))
+            return _diffrax(f, y0, args, method.step, moments, options.get("dt0"), make(rtol, atol), most, adjoint)
+        run = solve_adaptive(
+            f,
+            y0,
+            t0=times[0],
+            t1=times[-1],
+            args=args,
+            step=method.step,
+            rtol=rtol,
+            atol=atol,
+            max_steps=most,
+            dt0=options.get("dt0"),
+            breaks=options.get("breaks", ()),
+        )
+        tried = run.num_steps + run.num_rejected
+        return run.y, jnp.where(run.finished, -1, tried), tried
+
+    return run
+
+
+def final_state(method: Method, run: FixedRun | AdaptiveRun, f: VectorField, t0: float, t1: float, adjoint: Any):
+    """``final(y0, args)``: the state at t1, of a program of its own that has a reverse mode."""
+    adjoint = method.options.get("adjoint", adjoint)
+    ends = np.array([t0, t1])
+
+    def final(y0, args):
+        dtype = trees.time_dtype(y0)
+        if isinstance(run, AdaptiveRun):
+            tolerances = jnp.asarray(run.rtol, dtype), jnp.asarray(run.atol, dtype)
+            states = adaptive_program(method, f, ends, adjoint)(y0, args, *tolerances)[0]
+        elif is_diffrax(method.step):
+            import diffrax
+
+            dt, equal = jnp.asarray(run.dt, dtype), diffrax.ConstantStepSize()
+            times = jnp.asarray(ends, dtype)
+            states = _diffrax(f, y0, args, method.step, times, dt, equal, run.num_steps + 8, adjoint)[0]
+        else:
+            states = solve(
                 f,
                 y0,
-                t0=self.t0,
-                t1=self.t1,
+                dt=run.dt,
+                num_steps=run.num_steps,
+                t0=t0,
                 args=args,
-                step=self.method,
-                rtol=self.tolerance,
-                atol=self.tolerance,
-                max_steps=MOST_ADAPTIVE_STEPS,
-            )
-            tried = run.num_steps + run.num_rejected
-            return run.y, jnp.where(run.finished, -1, tried), tried
-        import diffrax
+                step=method.step,
+                save_every=run.num_steps,
+                compensated=method.compensated,
+                checkpoint=method.options.get("checkpoint"),
+                breaks=method.options.get("breaks", ()),
+            ).y
+        return jax.tree.map(lambda leaf: leaf[-1], states)
 
-        controller = diffrax.PIDController(rtol=self.tolerance, atol=self.tolerance)
-        times = jnp.asarray(self.times, trees.time_dtype(y0))
-        return _diffrax(f, y0, args, self.method, times, None, controller, MOST_ADAPTIVE_STEPS, adjoint)
+    return final
 
 
 def _diffrax(f, y0, args, solver, times, dt0, controller, most, adjoint):
@@ -180,46 +185,3 @@ def _diffrax(f, y0, args, solver, times, dt0, controller, most, adjoint):
     )
     failed = jnp.where(run.result == diffrax.RESULTS.successful, -1, run.stats["num_steps"])
     return run.ys, failed, run.stats["num_steps"]
-
-
-def fixed_grid(method: Any, t0: float, t1: float, dt: float) -> FixedRun:
-    """The run whose dt is nearest to the one asked for and divides the interval."""
-    num_steps = max(1, round((t1 - t0) / dt))
-    return FixedRun(method, t0, (t1 - t0) / num_steps, num_steps)
-
-
-def evaluations(
-    plan: Sequence[FixedRun | AdaptiveRun], f: VectorField, y0: PyTree, args: PyTree
-) -> list[Callable[..., Any]]:
-    """For each run of one method, evaluations of f as a function of the steps it took; counted while steps are taken.
-
-    A run of equal steps is counted over its first 4 and 8 steps, an adaptive one over its whole length, and scaled to
-    the steps taken: exact but for steps that iterate. Products with the Jacobian of f are not counted.
-    """
-
-    def counter(make_run: Callable[..., Any]) -> Callable[..., Any]:
-        counted, read = counting(f)
-        program = jax.jit(lambda x: make_run(x)(counted, y0, args)[2])
-
-        def count(x: float) -> tuple[int, int]:
-            num_steps = int(program(x))
-            return read(), num_steps
-
-        return count
-
-    def fixed(num_steps):
-        return counter(lambda dt: FixedRun(plan[0].method, plan[0].t0, dt, num_steps))
-
-    four, eight = fixed(4), fixed(8)
-    adaptive_runs = [run for run in plan if isinstance(run, AdaptiveRun)]
-    adaptive = counter(lambda tolerance: dataclasses.replace(adaptive_runs[0], tolerance=tolerance))
-    laws = []
-    for run in plan:
-        if isinstance(run, AdaptiveRun):
-            all_of_them, taken = adaptive(run.tolerance)
-            first, each = 0.0, all_of_them / taken
-        else:
-            few, more = four(run.dt)[0], eight(run.dt)[0]
-            first, each = 2 * few - more, (more - few) / 4
-        laws.append(lambda num_steps, first=first, each=each: round(first + each * num_steps))
-    return laws

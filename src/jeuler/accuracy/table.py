@@ -10,15 +10,19 @@ from typing import Any
 
 import numpy as np
 
+from jeuler._core import checks
 from jeuler._core.component import result
 from jeuler._core.describe import table
+from jeuler.accuracy.markdown import markdown
 
 NAN = math.nan
 EMPTY_ROW: dict[str, Any] = {
+    "problem": "",
     "method": "",
     "dtype": "",
     "dt": NAN,
-    "tolerance": NAN,
+    "rtol": NAN,
+    "atol": NAN,
     "num_steps": -1,
     "evaluations": -1,
     "compile_seconds": NAN,
@@ -39,6 +43,10 @@ EMPTY_ROW: dict[str, Any] = {
     "gradient_seconds_median": NAN,
     "gradient_bytes": -1,
     "pareto": False,
+    "stability_limit": NAN,
+    "reference_error": NAN,
+    "t0": NAN,
+    "t1": NAN,
     "reason": "",
 }
 
@@ -48,13 +56,14 @@ class Summary:
     """What the rows of one method in one precision say together.
 
     Attributes:
-      method, dtype: whose rows.
+      problem, method, dtype: whose rows.
       order: slope of log error against log dt, from the points above the floor; NaN with fewer than two.
       roundoff_floor: the error below which more steps do not get; NaN if the sweep did not reach it.
       floor_dt: the dt at which more steps stop helping, s; NaN if the sweep did not reach it.
       stability_limit: largest stable dt at the initial state, s; inf if none, 0.0 if no dt is, NaN if unknown.
     """
 
+    problem: str
     method: str
     dtype: str
     order: float
@@ -65,132 +74,236 @@ class Summary:
 
 @result
 class WorkPrecision:
-    """Error against seconds, one row a run.
+    """Error against seconds and evaluations, one row a run; ``a + b`` has the rows of both.
+
+    Where two tables have a run in common (problem, method, precision, dt or tolerances), the sum has that of the
+    second. Tables of one problem must agree on its interval and on its exact end state; give others a name,
+    ``work_precision(problem=...)``.
 
     Attributes:
-      rows: a list of dictionaries, ready for ``pandas.DataFrame(table.rows)``: method, dtype, dt (s; NaN for
-        adaptive runs), tolerance (NaN for fixed steps), num_steps, evaluations (of f), compile_seconds,
-        run_seconds (every repeat), run_seconds_min, run_seconds_median; error_final, error_max, error_l2
-        (Euclidean norm over the state; at t1, largest over the saved times, root mean square over them) and
-        each with _relative; gradient_error, gradient_error_relative, gradient_compile_seconds,
-        gradient_seconds, gradient_seconds_min, gradient_seconds_median, gradient_bytes (temporary memory);
-        pareto (no other row is both faster and more accurate); reason (why a row is NaN; empty if it is not).
-      stability_limits: largest stable dt of each method at the initial state, s.
-      reference_error: how far the reference itself may be trusted at t1; errors below say nothing.
-      interval: (t0, t1), s.
+      rows: a list of dictionaries, ready for ``pandas.DataFrame(table.rows)``: problem, method, dtype, dt (s; NaN for
+        adaptive runs), rtol and atol (NaN for fixed steps), num_steps, evaluations (of f, in that precision),
+        compile_seconds (of the program that all dts of a method share), run_seconds (every repeat), run_seconds_min,
+        run_seconds_median; error_final, error_max, error_l2 (norm of the error at t1, largest over the run, root mean
+        square over it) and each with _relative; gradient_error, gradient_error_relative, gradient_compile_seconds,
+        gradient_seconds, gradient_seconds_min, gradient_seconds_median, gradient_bytes (temporary memory); pareto (no
+        other row of the problem is both faster and more accurate); stability_limit (largest stable dt of the method at
+        the initial state, s), reference_error (how far the reference itself may be trusted at t1; errors below say
+        nothing), t0, t1; reason (why a row has no errors; empty if it has).
     Example:
       >>> import jeuler
-      >>> table = jeuler.work_precision(lambda t, y, args: -y, 1.0, t1=1.0, dts=[0.1, 0.01, 0.001],
-      ...     steps={"Euler": jeuler.euler_step}, reference=lambda t: 2.718281828459045**-t, repeats=1)
+      >>> def table_of(steps):
+      ...     return jeuler.work_precision(lambda t, y, args: -y, 1.0, t1=1.0, dts=[0.1, 0.01, 0.001], steps=steps,
+      ...         reference=lambda t: 2.718281828459045**-t, repeats=1, problem="decay")
+      >>> table = table_of({"Euler": jeuler.euler_step})
       >>> [(row["num_steps"], round(row["error_final_relative"], 4)) for row in table.rows]
       [(10, 0.0522), (100, 0.005), (1000, 0.0005)]
       >>> round(table.summary[0].order, 1), round(table.stability_limits["Euler"], 6)
       (1.0, 2.0)
+      >>> [summary.method for summary in (table + table_of({"Heun": jeuler.heun_step})).summary]
+      ['Euler', 'Heun']
 
     Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, 1996, sect. IV.10.
     """
 
     rows: list[dict[str, Any]]
-    stability_limits: dict[str, float]
-    reference_error: float
-    interval: tuple[float, float]
 
-    def series(self) -> Iterator[tuple[str, str, list[dict[str, Any]]]]:
-        """(method, dtype, its fixed-step rows from coarse to fine)."""
-        for method, dtype in dict.fromkeys((row["method"], row["dtype"]) for row in self.rows):
-            own = [r for r in self.rows if (r["method"], r["dtype"]) == (method, dtype) and math.isfinite(r["dt"])]
-            yield method, dtype, sorted(own, key=lambda row: -row["dt"])
+    def __add__(self, other: Any) -> WorkPrecision:
+        if not isinstance(other, WorkPrecision):
+            return NotImplemented
+        for problem in self.problems:
+            _check_same(problem, self.where(problem=problem).rows, other.where(problem=problem).rows)
+        rows = {_key(row): dict(row) for row in (*self.rows, *other.rows)}
+        both = list(rows.values())
+        mark_pareto(both)
+        return WorkPrecision(both)
+
+    def where(self, **wanted: Any) -> WorkPrecision:
+        """The table of the rows that have these values, or one of a list of values: ``table.where(method="RK4")``.
+
+        The Pareto marks stay those of the whole.
+        """
+        for name in wanted:
+            if name not in EMPTY_ROW:
+                raise ValueError(f"where takes columns of the table, {', '.join(EMPTY_ROW)}; got {name!r}")
+        allowed = {name: value if isinstance(value, (list, tuple)) else [value] for name, value in wanted.items()}
+        return WorkPrecision([row for row in self.rows if all(row[name] in allowed[name] for name in allowed)])
+
+    def front(self, against: str = "seconds", error: str = "final") -> list[dict[str, Any]]:
+        """The rows that no other of their problem beats in both cost and error, whatever the precision.
+
+        against: "seconds" or "evaluations"; error: "final", "max", "l2" or "gradient".
+        """
+        name = "gradient" if error == "gradient" else "run"
+        cost = f"{name}_seconds_min" if against == "seconds" else against
+        size = "gradient_error" if error == "gradient" else f"error_{error}"
+        of_each = ([row for row in self.rows if row["problem"] == problem] for problem in self.problems)
+        return [row for rows in of_each for row in best_of(rows, cost, size)]
+
+    @property
+    def problems(self) -> list[str]:
+        """The names of the problems, in the order of the rows."""
+        return list(dict.fromkeys(row["problem"] for row in self.rows))
+
+    @property
+    def dtypes(self) -> list[str]:
+        """The precisions, in the order of the rows."""
+        return list(dict.fromkeys(row["dtype"] for row in self.rows))
+
+    @property
+    def stability_limits(self) -> dict[str, float]:
+        """Largest stable dt of each method at the initial state, s, of a table of one problem."""
+        self._only_problem("stability_limits")
+        return {row["method"]: row["stability_limit"] for row in self.rows}
+
+    @property
+    def reference_error(self) -> float:
+        """How far the reference may be trusted at t1, of a table of one problem."""
+        self._only_problem("reference_error")
+        return max((row["reference_error"] for row in self.rows), default=NAN)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """(t0, t1), s, of a table of one problem."""
+        self._only_problem("interval")
+        return self.rows[0]["t0"], self.rows[0]["t1"]
+
+    def _only_problem(self, what: str) -> None:
+        if len(self.problems) != 1:
+            raise ValueError(
+                f"{what} is that of one problem, got {self.problems}; write table.where(problem=...).{what}"
+            )
+
+    def series(self) -> Iterator[tuple[tuple[str, str, str], list[dict[str, Any]]]]:
+        """(problem, method, dtype), and its fixed-step rows from coarse to fine."""
+        for key in dict.fromkeys((row["problem"], row["method"], row["dtype"]) for row in self.rows):
+            own = [r for r in self.rows if (r["problem"], r["method"], r["dtype"]) == key and math.isfinite(r["dt"])]
+            yield key, sorted(own, key=lambda row: -row["dt"])
 
     @property
     def summary(self) -> list[Summary]:
         """Order, floor and stability limit of each method in each precision."""
         found = []
-        for method, dtype, rows in self.series():
-            least = self.reference_error
-            rows = [row for row in rows if math.isfinite(row["error_final"]) and row["error_final"] > least]
+        for key, rows in self.series():
+            limit = rows[0]["stability_limit"] if rows else NAN
+            rows = [row for row in rows if row["error_final"] > row["reference_error"]]
             dt = np.array([row["dt"] for row in rows])
             error = np.array([row["error_final"] for row in rows])
             relative = np.array([row["error_final_relative"] for row in rows])
             floor, floor_dt = roundoff_floor(dt, error)
             order = fitted_order(dt, error, relative, floor, floor_dt)
-            limit = self.stability_limits.get(method, NAN)
-            found.append(Summary(method, dtype, order, floor, floor_dt, limit))
+            found.append(Summary(*key, order, floor, floor_dt, limit))
         return found
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write every row, every column; repeats separated by spaces."""
-        with open(path, "w", newline="") as file:
+        """Write every row, every column; repeats separated by spaces. `from_csv` reads it back."""
+        with open(path, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(EMPTY_ROW))
             writer.writeheader()
             for row in self.rows:
                 writer.writerow({k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()})
 
+    @classmethod
+    def from_csv(cls, path: str | os.PathLike[str]) -> WorkPrecision:
+        """The table that `to_csv` wrote, every number as it was."""
+        with open(path, newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if list(reader.fieldnames or []) != list(EMPTY_ROW):
+                raise ValueError(
+                    f"{os.fspath(path)} must have the columns that WorkPrecision.to_csv writes, "
+                    f"{', '.join(EMPTY_ROW)}; got {checks.shown(reader.fieldnames)}"
+                )
+            rows = []
+            for line, cells in enumerate(reader, 2):
+                try:
+                    rows.append({name: _read(cells[name], empty) for name, empty in EMPTY_ROW.items()})
+                except (TypeError, ValueError) as error:
+                    raise ValueError(f"{os.fspath(path)}, line {line}: {error}") from None
+        return cls(rows)
+
     def to_markdown(self) -> str:
         """One line a method and dt (or tolerance); each precision has its columns. Bold: on the Pareto front."""
-        dtypes = list(dict.fromkeys(row["dtype"] for row in self.rows))
-        gradient = any(math.isfinite(row["gradient_error"]) for row in self.rows)
-        columns = [
-            "relative error",
-            "seconds",
-            *(["gradient error", "gradient seconds", "MiB"] if gradient else []),
-        ]
-        head = ["method", "dt, s", "steps", "evaluations"] + [f"{c}, {d}" for d in dtypes for c in columns]
-        lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-        grid: dict[tuple[Any, ...], dict[str, dict[str, Any]]] = {}
-        for row in self.rows:
-            fixed = math.isfinite(row["dt"])
-            key = row["method"], f"{row['dt']:.3g}" if fixed else f"tolerance {row['tolerance']:.0e}"
-            grid.setdefault(key, {})[row["dtype"]] = row
-        for (method, size), by_dtype in grid.items():
-            first = next(iter(by_dtype.values()))
-            cells = [method, size, _count(first["num_steps"]), _count(first["evaluations"])]
-            for dtype in dtypes:
-                row = by_dtype.get(dtype, {"reason": "-"})
-                if row["reason"]:
-                    cells += [row["reason"], *[""] * (len(columns) - 1)]
-                    continue
-                error = f"{row['error_final_relative']:.1e}"
-                cells += [f"**{error}**" if row["pareto"] else error, f"{row['run_seconds_min']:.2e}"]
-                if gradient:
-                    cells += [f"{row['gradient_error_relative']:.1e}", f"{row['gradient_seconds_min']:.2e}"]
-                    cells += [f"{row['gradient_bytes'] / 2**20:.2f}"]
-            lines.append("| " + " | ".join(cells) + " |")
-        return "\n".join(lines)
+        return markdown(self)
 
     def _repr_html_(self) -> str:
         lines = (line.removeprefix("|").removesuffix("|").split("|") for line in self.to_markdown().splitlines())
         head, _, *rows = ([cell.strip("* ") for cell in cells] for cells in lines)
         return table("WorkPrecision", rows, head)
 
-    def plot(self, ax: Any = None) -> Any:
-        """Error against seconds and error against dt, logarithmic, each method labelled at its line.
+    def plot(self, ax: Any = None, *, against: Any = ("seconds", "dt"), error: str = "final") -> Any:
+        """Errors, logarithmic, each method labelled at its line.
 
         Args:
-          ax: None makes a figure with both; one axes takes error against seconds; a pair takes both.
-        Returns: the axes drawn on, a matplotlib axes or a pair of them.
+          ax: None makes a figure with a row of axes for each problem and precision; or one axes for each of
+            ``against``, all in them.
+          against: "seconds", "evaluations" or "dt", or several of them.
+          error: the one at the end, "final", the largest, "max", the root mean square, "l2", or that of the gradient,
+            "gradient", whose seconds are then those of the gradient.
+        Returns: the axes drawn on, an array with a column for each of ``against``, or as given.
         """
         from jeuler.plotting.accuracy import plot_work_precision
 
-        return plot_work_precision(self, ax)
+        return plot_work_precision(self, ax, against=against, error=error)
 
 
-def _count(n: int) -> str:
-    return f"{n:,}" if n >= 0 else "-"
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    """What tells a run from others; NaN as None, which is equal to itself."""
+    size = (None if math.isnan(row[name]) else row[name] for name in ("dt", "rtol", "atol"))
+    return row["problem"], row["method"], row["dtype"], *size
 
 
-def mark_pareto(rows: list[dict[str, Any]], reference_error: float = 0.0) -> None:
-    """Mark the rows that no other row beats in both error and seconds; an error of over 100 % is no result.
+def _read(cell: str, empty: Any) -> Any:
+    """A cell of the file, of the type that the column has."""
+    if isinstance(empty, tuple):
+        return tuple(map(float, cell.split()))
+    if isinstance(empty, bool):
+        if cell not in ("True", "False"):
+            raise ValueError(f"expected True or False, got {cell!r}")
+        return cell == "True"
+    return type(empty)(cell)
 
-    Nor is one below that of the reference.
-    """
+
+def _check_same(problem: str, rows: list[dict[str, Any]], others: list[dict[str, Any]]) -> None:
+    """One ValueError if rows under one name are of different problems, as the interval or the exact end state tells."""
+    name = f"problem {problem!r}" if problem else "the problem without a name"
+    hint = "give the other one a name, work_precision(problem=...)"
+    intervals = {(row["t0"], row["t1"]) for row in (*rows, *others)}
+    if len(intervals) > 1:
+        raise ValueError(f"{name} must have one interval (t0, t1), got {sorted(intervals)}; {hint}")
+    sizes = [
+        row["error_final"] / row["error_final_relative"]
+        for row in (*rows, *others)
+        if math.isfinite(row["error_final"]) and 0 < row["error_final_relative"] < math.inf
+    ]
+    if others and sizes and max(sizes) > min(sizes) * (1 + 1e-6):
+        raise ValueError(
+            f"{name} must have one exact end state and one norm, got ends of size {min(sizes):.8g} and "
+            f"{max(sizes):.8g}; {hint}"
+        )
+
+
+def mark_pareto(rows: list[dict[str, Any]]) -> None:
+    """Mark the rows that no other row of the problem beats in both error and seconds."""
     for row in rows:
         row["pareto"] = False
-    best = math.inf
-    known = [row for row in rows if math.isfinite(row["error_final"]) and row["error_final"] >= reference_error]
-    able = [row for row in known if not row["error_final_relative"] > 1]
-    for row in sorted(able, key=lambda row: (row["run_seconds_min"], row["error_final"])):
-        if row["error_final"] < best:
-            row["pareto"], best = True, row["error_final"]
+    for row in WorkPrecision(rows).front():
+        row["pareto"] = True
+
+
+def best_of(rows: list[dict[str, Any]], cost: str, error: str) -> list[dict[str, Any]]:
+    """The rows that no other beats in both error and cost. An error of over 100 % is no result.
+
+    Nor is an error at the end that is below that of the reference.
+    """
+    best, found = math.inf, []
+    able = [r for r in rows if math.isfinite(r[error]) and not r[f"{error}_relative"] > 1 and r[cost] > 0]
+    if error != "gradient_error":
+        able = [row for row in able if row["error_final"] >= row["reference_error"]]
+    for row in sorted(able, key=lambda row: (row[cost], row[error])):
+        if row[error] < best:
+            found.append(row)
+            best = row[error]
+    return found
 
 
 def roundoff_floor(dt: np.ndarray, error: np.ndarray) -> tuple[float, float]:

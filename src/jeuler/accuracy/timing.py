@@ -36,28 +36,40 @@ class Measurement:
         return float(np.median(self.run_seconds))
 
 
+class Compiled:
+    """A program compiled ahead for inputs of one form, and what that took."""
+
+    def __init__(self, function: Callable[..., Any], *inputs: Any) -> None:
+        begun = time.perf_counter()
+        self.program = jax.jit(function).lower(*inputs).compile()
+        self.seconds = time.perf_counter() - begun
+
+    def once(self, *inputs: Any) -> tuple[float, Any]:
+        """Seconds of one run, and what it returned."""
+        begun = time.perf_counter()
+        result = jax.block_until_ready(self.program(*inputs))
+        return time.perf_counter() - begun, result
+
+    def measure(
+        self, *inputs: Any, repeats: int = 5, budget: float = 1.0, patience: float = float("inf")
+    ) -> Measurement:
+        """Run it once unmeasured, then ``repeats`` times measured.
+
+        Fewer times, but at least once, where they would take more than ``budget`` seconds together. A first run
+        longer than ``patience`` seconds is the only one, and is itself the measurement.
+        """
+        first, result = self.once(*inputs)  # carries one-time costs: pages, threads, caches
+        repeats = max(1, min(repeats, int(budget / first)))
+        runs = (first,) if first > patience else tuple(self.once(*inputs)[0] for _ in range(repeats))
+        memory = self.program.memory_analysis()
+        return Measurement(result, self.seconds, runs, getattr(memory, "temp_size_in_bytes", -1))
+
+
 def measure(
     function: Callable[..., Any], *inputs: Any, repeats: int = 5, budget: float = 1.0, patience: float = float("inf")
 ) -> Measurement:
-    """Compile function for these inputs, run it once unmeasured, then ``repeats`` times measured.
-
-    Fewer times, but at least once, where they would take more than ``budget`` seconds together. A first run
-    longer than ``patience`` seconds is the only one, and is itself the measurement.
-    """
-    begun = time.perf_counter()
-    compiled = jax.jit(function).lower(*inputs).compile()
-    compile_seconds = time.perf_counter() - begun
-
-    def once() -> tuple[float, Any]:
-        begun = time.perf_counter()
-        result = jax.block_until_ready(compiled(*inputs))
-        return time.perf_counter() - begun, result
-
-    first, result = once()  # carries one-time costs: pages, threads, caches
-    repeats = max(1, min(repeats, int(budget / first)))
-    runs = (first,) if first > patience else tuple(once()[0] for _ in range(repeats))
-    memory = compiled.memory_analysis()
-    return Measurement(result, compile_seconds, runs, getattr(memory, "temp_size_in_bytes", -1))
+    """Compile function for these inputs and measure it."""
+    return Compiled(function, *inputs).measure(*inputs, repeats=repeats, budget=budget, patience=patience)
 
 
 def counting(f: Callable[..., Any]) -> tuple[Callable[..., Any], Callable[[], int]]:

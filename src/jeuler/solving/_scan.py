@@ -207,12 +207,10 @@ def scan_grid(
     ``within(run, carry)`` does what ``run(carry)`` does, the steps between two saved states, on a part of the carry.
     """
 
+    advance = _watched(next_state, grid.clock, watch)
+
     def one_step(carry, _):
-        n, first_nonfinite, state = carry
-        state = next_state(n, grid.clock(n), state)
-        n = n + 1
-        newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite(watch(state[0]))
-        return (n, jnp.where(newly_nonfinite, n, first_nonfinite), state), None
+        return advance(carry), None
 
     def saved(carry):
         n, _, (y, _) = carry
@@ -231,6 +229,54 @@ def scan_grid(
     t, y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), saved(carry), rest)
     left = unresolved(last)
     return Solution(t, y, first_nonfinite, jnp.int32(0) if left is None else left)
+
+
+def _watched(next_state: Callable[..., PyTree], clock: Callable[[Array], Array], watch: Callable[[PyTree], PyTree]):
+    """One step on (number of steps so far, first of them that was not finite, state)."""
+
+    def advance(carry):
+        n, first_nonfinite, state = carry
+        state = next_state(n, clock(n), state)
+        n = n + 1
+        newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite(watch(state[0]))
+        return n, jnp.where(newly_nonfinite, n, first_nonfinite), state
+
+    return advance
+
+
+def solve_to(
+    f: VectorField,
+    y0: PyTree,
+    *,
+    dt: Array,
+    ends: Array,
+    t0: Any,
+    args: Any,
+    step: Step,
+    compensated: bool,
+    breaks: Any,
+) -> tuple[PyTree, Array]:
+    """y0 and the states of `solve` after these numbers of steps, (end,) and rising, and its ``first_nonfinite``.
+
+    dt and ends are inputs of the compiled program, so that one does for every number of steps. Not for reverse mode.
+    """
+    advance = advance_by(step, compensated=compensated)
+    breaks = checked_breaks(breaks, dt.dtype)
+    if breaks.size:
+        advance = split_at(advance, breaks)
+    t0 = jnp.asarray(t0, dt.dtype)
+    one_step = _watched(
+        lambda n, t, state: advance(f, t, state, dt, args), lambda n: t0 + n.astype(dt.dtype) * dt, lambda y: y
+    )
+
+    def to_end(carry, end):
+        carry = lax.while_loop(lambda carry: carry[0] < end, one_step, carry)
+        return carry, carry[2][0]
+
+    none = jnp.zeros((), ends.dtype)
+    start = none, none - 1, (y0, no_remainder(y0, compensated))
+    (_, first_nonfinite, _), states = lax.scan(to_end, start, ends)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, states), first_nonfinite
 
 
 def _scan(body: Callable[..., Any], carry: PyTree, count: int, segment: int | None) -> tuple[PyTree, PyTree]:
