@@ -71,6 +71,14 @@ def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
     """
     if jax.config.jax_disable_jit or _under_jit():  # type: ignore[attr-defined]
         return function(*inputs, *settings)
+    return prepared(function, inputs, settings)()
+
+
+def prepared(function: Callable, inputs: tuple, settings: tuple = ()) -> Call:
+    """`call`, for several calls of the same inputs: ``prepared(...)(*further)`` passes further pytrees of arrays.
+
+    What comes back takes the memory of the first of these, which cannot be used again.
+    """
     classes: set[type] = set()
     leaves, structure = jax.tree.flatten(inputs, is_leaf=functools.partial(_stands_alone, classes))
     try:
@@ -79,19 +87,45 @@ def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
         key = function, settings, structure, tokens, own
         program = by_structure.get(key)
     except (Opaque, TypeError):  # a TypeError: something that has no hash
-        return _traced_again(function, settings, leaves, structure)
+        return Call(function, settings, leaves, structure)
     if program is None:
         program = by_structure.put(key, Program(function, settings, structure, tokens))
-    if program.needs_values:
-        return _traced_again(function, settings, leaves, structure)
-    try:
-        return program(leaves, dynamic, arrays)
-    except (ValueError, *NEEDS_VALUES) as error:
-        if not _needs_values(error):
-            raise
-        # an array of a closure is used as a number while tracing, as in float(x)
-        program.needs_values = True
-        return _traced_again(function, settings, leaves, structure)
+    return Call(function, settings, leaves, structure, program, dynamic, arrays)
+
+
+class Call:
+    """A call with these inputs, by the program kept for their structure or, without one, traced for it alone."""
+
+    def __init__(
+        self,
+        function: Callable,
+        settings: tuple,
+        leaves: list,
+        structure: Any,
+        program: Program | None = None,
+        dynamic: list | None = None,
+        arrays: list | None = None,
+    ) -> None:
+        self.of_call = function, settings, leaves, structure
+        self.program, self.dynamic, self.arrays = program, dynamic, arrays
+        self.notes: dict[Any, Any] = {} if program is None else program.notes
+        self.compiled: Callable | None = None
+
+    def __call__(self, *further: Any) -> Any:
+        if self.compiled is not None:
+            return self.compiled(further)
+        program = self.program
+        if program is None or program.needs_values:
+            self.compiled = _traced_again(*self.of_call, further)
+            return self.compiled(further)
+        try:
+            return program(self.of_call[2], self.dynamic, self.arrays, further)
+        except (ValueError, *NEEDS_VALUES) as error:
+            if not needs_values(error):
+                raise
+            # an array of a closure is used as a number while tracing, as in float(x)
+            program.needs_values = True
+            return self(*further)
 
 
 class Program:
@@ -99,49 +133,53 @@ class Program:
 
     def __init__(self, function: Callable, settings: tuple, structure: Any, tokens: tuple) -> None:
         self.needs_values = False
+        self.notes: dict[Any, Any] = {}  # what its callers keep with it
 
-        def run(dynamic, arrays):
+        def run(dynamic, arrays, first, rest):
             given, made = iter(dynamic), WithArrays(arrays)
             pairs = zip(current.leaves, tokens, strict=True)
             leaves = [next(given) if name is None else made.of(leaf) for leaf, name in pairs]
-            return function(*jax.tree.unflatten(structure, leaves), *settings)
+            return function(*jax.tree.unflatten(structure, leaves), *settings, *first, *rest)
 
-        self.compiled = jax.jit(run)
+        self.compiled = jax.jit(run, donate_argnums=2)
 
-    def __call__(self, leaves: list, dynamic: list, arrays: list) -> Any:
+    def __call__(self, leaves: list, dynamic: list | None, arrays: list | None, further: tuple) -> Any:
         before, current.leaves = getattr(current, "leaves", None), leaves
         try:
-            return self.compiled(dynamic, arrays)
+            return self.compiled(dynamic, arrays, further[:1], further[1:])
         finally:
             current.leaves = before
 
 
-def _traced_again(function: Callable, settings: tuple, leaves: list, structure: Any) -> Any:
-    """The function traced for this call alone; what was compiled of the same text before is used again."""
+def _traced_again(function: Callable, settings: tuple, leaves: list, structure: Any, further: tuple) -> Callable:
+    """The function of what is ``further``, traced for this call alone; what was compiled of the same text is used."""
     is_dynamic = [_is_dynamic(leaf) for leaf in leaves]
     dynamic = [leaf for leaf, d in zip(leaves, is_dynamic, strict=True) if d]
 
-    def run(dynamic):
+    def run(dynamic, first, rest):
         given = iter(dynamic)
         merged = [next(given) if d else leaf for leaf, d in zip(leaves, is_dynamic, strict=True)]
-        return function(*jax.tree.unflatten(structure, merged), *settings)
+        return function(*jax.tree.unflatten(structure, merged), *settings, *first, *rest)
 
-    if _is_transformed():
-        return run(dynamic)
+    def as_it_is(further):
+        return run(dynamic, further[:1], further[1:])
+
+    if is_transformed():
+        return as_it_is
     try:
-        lowered = jax.jit(run).lower(dynamic)
+        lowered = jax.jit(run, donate_argnums=1).lower(dynamic, further[:1], further[1:])
     except (ValueError, *NEEDS_VALUES) as error:
-        if not _needs_values(error):
+        if not needs_values(error) or further:
             raise
-        return run(dynamic)
+        return as_it_is
     key = hashlib.sha256(lowered.as_text().encode()).digest(), lowered.in_tree, lowered.out_tree, _devices(dynamic)
     compiled = by_text.get(key) or by_text.put(key, lowered.compile())
-    return compiled(dynamic)
+    return lambda further: compiled(dynamic, further[:1], further[1:])
 
 
-def _needs_values(error: BaseException | None) -> bool:
+def needs_values(error: BaseException | None) -> bool:
     """Whether this error, or what it was raised from, is that something traced was asked for its value."""
-    return error is not None and (isinstance(error, NEEDS_VALUES) or _needs_values(error.__cause__))
+    return error is not None and (isinstance(error, NEEDS_VALUES) or needs_values(error.__cause__))
 
 
 def _tokens(leaves: list) -> tuple[list, list, tuple]:
@@ -186,11 +224,11 @@ def _devices(dynamic: list) -> tuple:
     return tuple([getattr(x, "sharding", None) for x in dynamic])
 
 
-def _is_transformed() -> bool:
+def is_transformed() -> bool:
     """Whether a derivative, a batch or a program is being worked out around this call."""
     return not core.trace_state_clean()
 
 
 def _under_jit() -> bool:
     """Whether a program is being traced around this call."""
-    return _is_transformed() and core.unsafe_am_i_under_a_jit()
+    return is_transformed() and core.unsafe_am_i_under_a_jit()

@@ -22,8 +22,10 @@ from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
 from jeuler.particles.step import SceneStep, with_its_needs
 from jeuler.particles.windows import in_windows
-from jeuler.solving._scan import INSTEAD, Solution, check_save, check_step, no_remainder, scan_grid, solve_reversibly
+from jeuler.solving._scan import INSTEAD, Solution, check_save, check_step, no_remainder, reversible_loop
+from jeuler.solving.chunks import Progress, can_be_in_chunks, check_progress, run_in_chunks
 from jeuler.solving.grid import Checkpoint, Grid
+from jeuler.solving.loop import Loop, in_one_scan
 from jeuler.steps.explicit import Step, euler_step
 
 ON_A_SCENE = {"args": "the mass with the state, state.replace(mass=...)", "mass": "state.replace(mass=...)"}
@@ -44,6 +46,7 @@ def simulate(
     checkpoint: Checkpoint = None,
     compensated: bool = False,
     windows: tuple[int, ...] | str = (),
+    progress: Progress = None,
 ) -> Solution:
     """Run a scene: num_steps steps of its equation of motion and its effects, in one ``lax.scan``.
 
@@ -67,6 +70,7 @@ def simulate(
       windows: sizes in increasing order, or "auto" for a ladder of them. Between two saved states the run works on
         the smallest of these many first slots that holds all that live or can be born, so that a large pool costs
         what is alive. Each size is compiled. Under ``vmap`` all sizes run: leave it empty there.
+      progress: a bar, or a function to call, as in `solve`.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -78,7 +82,8 @@ def simulate(
 
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
-    grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint)
+    check_progress(progress, checkpoint)
+    grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint, many=can_be_in_chunks(checkpoint))
     checks.true_or_false("compensated", compensated)
     check_parameters("scene", scene)
     inputs = scene, state, grid, key, Function(step), Function(save)
@@ -88,10 +93,16 @@ def simulate(
     settings = checkpoint, compensated, windows if isinstance(windows, str) else tuple(windows)
     if checkpoint == "reversible":  # looks at values
         return _simulate(*inputs, *settings)
-    return programs.call(_simulate, inputs, settings)
+    found = run_in_chunks(_loop, inputs, settings, grid, progress)
+    return programs.call(_simulate, inputs, settings) if found is None else Solution(*found)
 
 
-def _simulate(
+def _simulate(*given: Any) -> Solution:
+    """`simulate`, as it is compiled in one piece."""
+    return Solution(*in_one_scan(_loop(*given)))
+
+
+def _loop(
     scene: Scene,
     state: ParticleState,
     grid: Grid,
@@ -101,8 +112,8 @@ def _simulate(
     checkpoint: Checkpoint,
     compensated: bool,
     windows: tuple[int, ...] | str,
-) -> Solution:
-    """`simulate`, as it is compiled."""
+) -> Loop:
+    """The loop of `simulate`."""
     step, save = stepper.function, saver.function
     check_save(save)
     scene_step, state = first_step(scene, state, grid, step, key, compensated=compensated, any_window=bool(windows))
@@ -116,7 +127,7 @@ def _simulate(
     motion, rest = split_state(state)
     start = (motion, rest), no_remainder(motion, compensated)
     within = in_windows(windows, scene, state, grid.save_every)
-    return scan_grid(
+    return Loop(
         scene_step,
         start,
         grid,
@@ -136,6 +147,7 @@ def check_run(
     save_every: int,
     key: Array | None,
     checkpoint: Checkpoint = None,
+    many: bool = False,
 ) -> Grid:
     """Every check that looks at values, of these arguments of `simulate`: made at each call, traced or not."""
     check_kinds(scene, state)
@@ -143,7 +155,7 @@ def check_run(
     state.check()
     scene.check(state)
     dt = forwards(scene, dt)
-    return Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(state.position))
+    return Grid.checked(dt, num_steps, t0, save_every, checkpoint, trees.time_dtype(state.position), many)
 
 
 def check_kinds(scene: Any, state: Any) -> None:
@@ -206,15 +218,15 @@ def begin(
     return first_step(scene, state, grid, step, key, compensated=compensated)
 
 
-def _reversibly(run: SceneStep, state: ParticleState, saved: Any) -> Solution:
-    """`simulate` with ``checkpoint="reversible"``: forces alone, on particles that all live."""
+def _reversibly(run: SceneStep, state: ParticleState, saved: Any) -> Loop:
+    """The loop of `simulate` with ``checkpoint="reversible"``: forces alone, on particles that all live."""
     effects = run.scene.effects
     if effects or state.alive is not None:
         what = name_of(effects[0]) if effects else "a pool (alive)"
         raise ValueError(f'checkpoint="reversible" cannot undo effects or births, got {what}; pass checkpoint="sqrt"')
     motion, rest = split_state(state)
     attributes = run.scene.attributes(state)
-    return solve_reversibly(
+    return reversible_loop(
         run.field, motion, attributes, run.grid, lambda t, motion: saved(t, (motion, rest)), run.step, run.compensated
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +19,9 @@ from jeuler.solving._breaks import checked_breaks, split_at
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
 from jeuler.solving._tables import solution_table
-from jeuler.solving.grid import COUNTER, Checkpoint, Grid
+from jeuler.solving.chunks import Progress, can_be_in_chunks, check_progress, run_in_chunks
+from jeuler.solving.grid import Checkpoint, Grid
+from jeuler.solving.loop import Loop, in_one_scan, watched
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -89,13 +90,15 @@ def solve(
     checkpoint: Checkpoint = None,
     compensated: bool = False,
     breaks: Any = (),
+    progress: Progress = None,
 ) -> Solution:
     """Advance y' = f(t, y, args) by num_steps steps of size dt, in one ``lax.scan``.
 
         t_n = t0 + n dt,   y_{n+1} = step(f, t_n, y_n, dt, args)
 
     The time comes from an integer step counter, never from an accumulated sum. Works under jit, vmap, grad, jacfwd,
-    hessian and grad of grad as it is.
+    hessian and grad of grad as it is. Outside of these a long run is done in pieces of about 0.1 s, so that Ctrl-C
+    stops it, with the same numbers.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``, of the structure, shapes and dtypes of y.
@@ -118,6 +121,8 @@ def solve(
         in the last place instead of growing with the number of steps. Explicit steps only.
       breaks: times at which f may jump, (break,), s: the step that a break falls into ends there and goes on from it,
         and f is evaluated just before and just after. Differentiable.
+      progress: True shows a bar with an estimate of the end; a function is called as ``progress(step, num_steps)``
+        about ten times a second, and what it raises ends the run. Not under jit, vmap or grad, nor with "reversible".
     Returns: `Solution`, saved states with leading axis num_steps // save_every + 1, initial value first.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -130,7 +135,9 @@ def solve(
       sums: A. Neumaier, Rundungsfehleranalyse einiger Verfahren zur Summation endlicher Summen, 1974.
     """
     y0 = checks.state("y0", y0)
-    grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0))
+    check_progress(progress, checkpoint)
+    many = can_be_in_chunks(checkpoint)
+    grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0), many=many)
     checks.field_form(f)
     checks.true_or_false("compensated", compensated)
     f, args = arrays_only(f, args)
@@ -141,10 +148,16 @@ def solve(
     settings = checkpoint, compensated
     if checkpoint == "reversible":  # looks at values
         return _solve(*inputs, *settings)
-    return programs.call(_solve, inputs, settings)
+    found = run_in_chunks(_loop, inputs, settings, grid, progress)
+    return programs.call(_solve, inputs, settings) if found is None else Solution(*found)
 
 
-def _solve(
+def _solve(*given: Any) -> Solution:
+    """`solve`, as it is compiled in one piece."""
+    return Solution(*in_one_scan(_loop(*given)))
+
+
+def _loop(
     field: Function,
     y0: PyTree,
     args: PyTree,
@@ -154,14 +167,14 @@ def _solve(
     saver: Function,
     checkpoint: Any,
     compensated: bool,
-) -> Solution:
-    """`solve`, as it is compiled."""
+) -> Loop:
+    """The loop of `solve`."""
     f, step, save = field.function, stepper.function, saver.function
     check_step(step)
     check_save(save)
     checks.vector_field(f, grid.t0, y0, args)
     if checkpoint == "reversible":
-        return solve_reversibly(f, y0, args, grid, save, step, compensated)
+        return reversible_loop(f, y0, args, grid, save, step, compensated)
     advance = advance_by(step, compensated=compensated)
     if breaks.size:
         advance = split_at(advance, breaks)
@@ -169,10 +182,10 @@ def _solve(
     def next_state(n, t, y_and_remainder):
         return advance(f, t, y_and_remainder, grid.dt, args)
 
-    return scan_grid(next_state, (y0, no_remainder(y0, compensated)), grid, save)
+    return Loop(next_state, (y0, no_remainder(y0, compensated)), grid, save)
 
 
-def solve_reversibly(
+def reversible_loop(
     f: VectorField,
     y0: PyTree,
     args: Any,
@@ -180,8 +193,8 @@ def solve_reversibly(
     save: Callable[[Array, PyTree], PyTree] | None,
     step: Step,
     compensated: bool,
-) -> Solution:
-    """`solve` with ``checkpoint="reversible"``."""
+) -> Loop:
+    """The loop of `solve` with ``checkpoint="reversible"``."""
     check_reversible(f, grid.t0, y0, args, step, compensated)
     y0, between_saves = reversible(f, y0, args, grid)
 
@@ -190,58 +203,7 @@ def solve_reversibly(
         first_nonfinite, y = between_saves(n, first_nonfinite, y)
         return n + grid.save_every, first_nonfinite, (y, remainder)
 
-    return scan_grid(lambda n, t, state: state, (y0, None), grid, save, within=within)
-
-
-def scan_grid(
-    next_state: Callable[[Array, Array, PyTree], PyTree],
-    start: tuple[PyTree, PyTree],
-    grid: Grid,
-    save: Callable[[Array, PyTree], PyTree] | None,
-    watch: Callable[[PyTree], PyTree] = lambda y: y,
-    within: Callable[[Callable[[PyTree], PyTree], PyTree], PyTree] = lambda run, carry: run(carry),
-    unresolved: Callable[[PyTree], Any] = lambda y: None,
-) -> Solution:
-    """Carry (y, extra) over the grid by ``next_state(n, t, (y, extra))``, saving y and watching for the non-finite.
-
-    ``within(run, carry)`` does what ``run(carry)`` does, the steps between two saved states, on a part of the carry.
-    """
-
-    advance = _watched(next_state, grid.clock, watch)
-
-    def one_step(carry, _):
-        return advance(carry), None
-
-    def saved(carry):
-        n, _, (y, _) = carry
-        t = grid.clock(n)
-        return t, (y if save is None else save(t, y))
-
-    def one_save(carry, _):
-        carry = within(lambda carry: _scan(one_step, carry, grid.save_every, grid.segment)[0], carry)
-        return carry, saved(carry)
-
-    saved_form(save, grid.t0, start[0])
-    counter = jnp.int32 if grid.num_steps <= COUNTER else jnp.int64
-    carry = (jnp.zeros((), counter), jnp.full((), -1, counter), start)
-    blocks = None if grid.segment is None else max(1, grid.segment // grid.save_every)
-    (_, first_nonfinite, (last, _)), rest = _scan(one_save, carry, grid.num_steps // grid.save_every, blocks)
-    t, y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), saved(carry), rest)
-    left = unresolved(last)
-    return Solution(t, y, first_nonfinite, jnp.int32(0) if left is None else left)
-
-
-def _watched(next_state: Callable[..., PyTree], clock: Callable[[Array], Array], watch: Callable[[PyTree], PyTree]):
-    """One step on (number of steps so far, first of them that was not finite, state)."""
-
-    def advance(carry):
-        n, first_nonfinite, state = carry
-        state = next_state(n, clock(n), state)
-        n = n + 1
-        newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite(watch(state[0]))
-        return n, jnp.where(newly_nonfinite, n, first_nonfinite), state
-
-    return advance
+    return Loop(lambda n, t, state: state, (y0, None), grid, save, within=within)
 
 
 def solve_to(
@@ -265,7 +227,7 @@ def solve_to(
     if breaks.size:
         advance = split_at(advance, breaks)
     t0 = jnp.asarray(t0, dt.dtype)
-    one_step = _watched(
+    one_step = watched(
         lambda n, t, state: advance(f, t, state, dt, args), lambda n: t0 + n.astype(dt.dtype) * dt, lambda y: y
     )
 
@@ -277,25 +239,6 @@ def solve_to(
     start = none, none - 1, (y0, no_remainder(y0, compensated))
     (_, first_nonfinite, _), states = lax.scan(to_end, start, ends)
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y0, states), first_nonfinite
-
-
-def _scan(body: Callable[..., Any], carry: PyTree, count: int, segment: int | None) -> tuple[PyTree, PyTree]:
-    """Scan ``body`` count times; with a segment, reverse mode keeps only the carries between segments."""
-    if count == 1:  # no loop, and outputs with a leading axis of one
-        carry, out = body(carry, None)
-        return carry, jax.tree.map(lambda x: jnp.asarray(x)[None], out)
-    if segment is None or segment >= count:
-        # One step a turn: with four, Euler's method on small problems runs 1.7 times faster, but the gradient of two in
-        # three of them 10 to 50 times slower, as XLA on CPU no longer makes one kernel of a turn.
-        return lax.scan(body, carry, None, length=count)
-    inner = functools.partial(_scan, body, count=segment, segment=None)
-    many = jax.checkpoint(lambda carry, _: inner(carry), prevent_cse=False)
-    carry, out = lax.scan(many, carry, None, length=count // segment)
-    out = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), out)
-    if count % segment:
-        carry, rest = lax.scan(body, carry, None, length=count % segment)
-        out = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), out, rest)
-    return carry, out
 
 
 def no_remainder(y: PyTree, compensated: bool) -> PyTree:
@@ -314,15 +257,6 @@ def check_save(save: Any) -> None:
     """One ValueError if save is neither None nor a function of time and state."""
     if save is not None:
         checks.function("save", save, "(t, y) -> what is kept", "write save=lambda t, y: y.position, say")
-
-
-def saved_form(save: Callable[..., Any] | None, t: Array, y: PyTree) -> None:
-    """One ValueError if what save keeps of a state is not made of arrays."""
-    if save is None:
-        return
-    kept = checks.form_of("save", save, t, y)
-    if not jax.tree.leaves(kept):
-        raise ValueError("save must return arrays, what is kept of a saved state, got None; write return, or save=None")
 
 
 def advance_by(step: Any, *, compensated: bool) -> Callable[..., Any]:

@@ -28,11 +28,16 @@ class Grid:
     segment: int | None
 
     @classmethod
-    def checked(cls, dt: Any, num_steps: Any, t0: Any, save_every: Any, checkpoint: Checkpoint, dtype: Any) -> Grid:
-        """The grid of these arguments, or one ValueError that says which is wrong."""
+    def checked(
+        cls, dt: Any, num_steps: Any, t0: Any, save_every: Any, checkpoint: Checkpoint, dtype: Any, many: bool = False
+    ) -> Grid:
+        """The grid of these arguments, or one ValueError that says which is wrong.
+
+        ``many``: whether the run can have more steps than an int32 counts, wherever it is.
+        """
         num_steps = checks.count("num_steps", num_steps)
         save_every = checks.count("save_every", save_every, least=1)
-        check_counter(num_steps, save_every)
+        check_counter(num_steps, save_every, many)
         if num_steps % save_every:
             raise ValueError(
                 f"save_every must divide num_steps, got save_every={save_every} and num_steps={num_steps}; "
@@ -51,14 +56,14 @@ class Grid:
 COUNTER = 2**31 - 1  # the most steps that an int32 counts
 
 
-def check_counter(num_steps: int, save_every: int) -> None:
+def check_counter(num_steps: int, save_every: int, many: bool = False) -> None:
     """One ValueError if the run has more steps than its counter can count, which would turn time negative."""
     if num_steps <= COUNTER:
         return
-    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+    if not many and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise ValueError(
-            f"num_steps must be at most {COUNTER:,} where integers have 32 bits, got {num_steps:,}; "
-            f'write jax.config.update("jax_enable_x64", True), or go on from the last state in a second run with its t0'
+            f"num_steps must be at most {COUNTER:,} under jit, vmap and grad where integers have 32 bits, got "
+            f'{num_steps:,}; write jax.config.update("jax_enable_x64", True), or call it outside of these'
         )
     if max(save_every, num_steps // save_every) > COUNTER:
         raise ValueError(
