@@ -73,6 +73,8 @@ RESULTS = {
     "Compensated": lambda: jeuler.Compensated(jeuler.euler_step),
     "StabilityLimit": lambda: jeuler.stability_limit(lambda t, y, args: -4.0 * y, 0.0, 1.0),
     "StepAdvice": lambda: jeuler.StepAdvice(0.01, 100, 1e-3, 2.0, 1e-7, True, "accuracy sets dt"),
+    "MethodAdvice": lambda: jeuler.advise_method(decay, 1.0, t1=1.0, error=0.1, methods={"Euler": jeuler.euler_step}),
+    "RankedMethod": lambda: RESULTS["MethodAdvice"]().best,
     "Diagnosis": lambda: jeuler.Diagnosis(False, step=3, part="forces[0] Springs", springs=(4,), cause="it blew up"),
     "Trajectory": trajectory,
     "Setup": jeuler.scenes.fountain,

@@ -1,7 +1,7 @@
 """jeuler: differentiable Euler integration of springs, particles and ODEs in JAX.
 
-The verbs stand here: `solve`, `simulate`, `fit`, `fit_springs`, `advise_step`, `work_precision`, `stability_limit`,
-`diagnose`. The catalogues have a namespace each: `jeuler.forces`, `jeuler.effects`, `jeuler.contact`,
+The verbs stand here: `solve`, `simulate`, `fit`, `fit_springs`, `advise_step`, `advise_method`, `work_precision`,
+`stability_limit`, `diagnose`. The catalogues have a namespace each: `jeuler.forces`, `jeuler.effects`, `jeuler.contact`,
 `jeuler.samplers`, `jeuler.steps`; figures are in `jeuler.plotting`, example scenes in `jeuler.scenes`.
 """
 
@@ -10,7 +10,17 @@ from jeuler import effects as effects
 from jeuler import forces as forces
 from jeuler import samplers as samplers
 from jeuler import steps as steps
-from jeuler.accuracy import Compensated, Method, StepAdvice, WorkPrecision, advise_step, work_precision
+from jeuler.accuracy import (
+    Compensated,
+    Method,
+    MethodAdvice,
+    RankedMethod,
+    StepAdvice,
+    WorkPrecision,
+    advise_method,
+    advise_step,
+    work_precision,
+)
 from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
 from jeuler.diagnosis import Diagnosis, diagnose
 from jeuler.effects import (
@@ -96,6 +106,7 @@ __all__ = [
     "Lifetime",
     "LinearDrag",
     "Method",
+    "MethodAdvice",
     "Normal",
     "OverLife",
     "ParticleState",
@@ -104,6 +115,7 @@ __all__ = [
     "PointAttractor",
     "PrescribedMotion",
     "QuadraticDrag",
+    "RankedMethod",
     "SampledPath",
     "Scene",
     "ShapeMatching",
@@ -123,6 +135,7 @@ __all__ = [
     "Vortex",
     "Wind",
     "WorkPrecision",
+    "advise_method",
     "advise_step",
     "cap_cotangent",
     "diagnose",

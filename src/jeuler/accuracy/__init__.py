@@ -2,14 +2,18 @@
 
 from jeuler.accuracy._work_precision import work_precision
 from jeuler.accuracy.advice import StepAdvice, advise_step
+from jeuler.accuracy.choice import MethodAdvice, RankedMethod, advise_method
 from jeuler.accuracy.method import Compensated, Method
 from jeuler.accuracy.table import WorkPrecision
 
 __all__ = [
     "Compensated",
     "Method",
+    "MethodAdvice",
+    "RankedMethod",
     "StepAdvice",
     "WorkPrecision",
+    "advise_method",
     "advise_step",
     "work_precision",
 ]

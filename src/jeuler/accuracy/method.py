@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -84,8 +85,15 @@ class Method:
         return not getattr(base, "explicit", False)
 
 
+def has_diffrax() -> bool:
+    """Whether diffrax is installed."""
+    return importlib.util.find_spec("diffrax") is not None
+
+
 def is_diffrax(step: Any) -> bool:
     """Whether it is a solver of diffrax."""
+    if not has_diffrax():
+        return False
     import diffrax
 
     return isinstance(step, diffrax.AbstractSolver)

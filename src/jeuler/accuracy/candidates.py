@@ -1,0 +1,254 @@
+"""The methods that advise_method compares, each as one program: of the number of steps, or of tolerances."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jeuler._core import trees
+from jeuler._core.precision import double_precision
+from jeuler.accuracy.method import has_diffrax, is_diffrax
+from jeuler.solving._adaptive import solve_adaptive
+from jeuler.solving._breaks import checked_breaks, split_at
+from jeuler.solving._scan import advance_by
+from jeuler.steps.explicit import (
+    VectorField,
+    euler_step,
+    heun_step,
+    rk4_step,
+    symplectic_euler_step,
+)
+from jeuler.steps.extrapolated import extrapolated_euler
+from jeuler.steps.implicit import implicit_euler_step, linearly_implicit_euler_step
+
+PyTree = Any
+MOST_STEPS, MOST_IMPLICIT_STEPS = 65_536, 16_384  # of an adaptive run
+LEAST_STEPS, WORK = 4096, 2**28  # of one of a large system: numbers advanced
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A method under its name.
+
+    Attributes:
+      name: in the table.
+      step: a step or a diffrax solver; None for the default of `solve_adaptive`.
+      adaptive: whether its steps are chosen by a tolerance.
+      code: how the step is written.
+    """
+
+    name: str
+    step: Any
+    adaptive: bool
+    code: str
+
+    @property
+    def order(self) -> int:
+        if is_diffrax(self.step):
+            return int(self.step.order(None) or 1)
+        return int(getattr(self.step, "order", 1))
+
+    @property
+    def program_size(self) -> float:
+        """About how many times the compilation of an explicit adaptive run its own takes, if it solves equations."""
+        if is_diffrax(self.step):
+            import diffrax
+
+            return 6.0 if isinstance(self.step, diffrax.AbstractImplicitSolver) else 0.0
+        base = getattr(self.step, "base", self.step or euler_step)
+        return 0.0 if hasattr(base, "increment") else 2.0
+
+
+def default_candidates(f: VectorField, y0: PyTree, t0: float, args: PyTree) -> list[Candidate]:
+    """All steps of the library and four solvers of diffrax, those first that are most likely to be fast."""
+    found = [explicit_reference()]
+    found += [Candidate("rk4_step", rk4_step, False, "jeuler.rk4_step")]
+    found += [Candidate("heun_step", heun_step, False, "jeuler.heun_step")]
+    if is_motion(f, y0, t0, args):
+        name = "symplectic_euler_step"
+        found += [Candidate(name, symplectic_euler_step, False, f"jeuler.{name}")]
+    found += [Candidate("euler_step", euler_step, False, "jeuler.euler_step")]
+    for order in (4, 8):
+        name = f"extrapolated_euler({order})"
+        found += [Candidate(name, extrapolated_euler(order), False, f"jeuler.{name}")]
+    if has_diffrax():
+        import diffrax
+
+        for solver in (diffrax.Tsit5(), diffrax.Heun(), diffrax.Euler(), diffrax.Kvaerno5()):
+            name = f"diffrax.{type(solver).__name__}"
+            adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver)
+            found += [Candidate(name, solver, adaptive, f"{name}()")]
+    found.append(stiff_reference())
+    for step in (linearly_implicit_euler_step, implicit_euler_step):
+        name = step.__name__
+        found += [Candidate(name, step, False, f"jeuler.{name}")]
+    return found
+
+
+def given_candidates(methods: Mapping[str, Any]) -> list[Candidate]:
+    """Methods of the person's own, a diffrax solver by its tolerance where it has an error estimate."""
+
+    def adaptive(method: Any) -> bool:
+        if not is_diffrax(method):
+            return method is None
+        import diffrax
+
+        return isinstance(method, diffrax.AbstractAdaptiveSolver)
+
+    return [
+        Candidate(name, method, adaptive(method), f"methods[{name!r}]" if method else "")
+        for name, method in methods.items()
+    ]
+
+
+def is_motion(f: VectorField, y0: PyTree, t0: float, args: PyTree) -> bool:
+    """Whether y is a pair (position, velocity), the slope of position being the velocity: seen at two states.
+
+    What does not move, as a pinned particle, may have a slope of 0 there.
+    """
+    parts, pair = trees.parts(y0)
+    forms = [[leaf.shape for leaf in jax.tree.leaves(part)] for part in parts]
+    if len(forms) != 2 or forms[0] != forms[1]:
+        return False
+    with double_precision():
+        for factor in (0.9, 0.7):
+            velocity = jax.tree.map(lambda leaf, factor=factor: factor * leaf + (1 - factor), parts[1])
+            slope = pair.flatten_up_to(f(t0, pair.unflatten((parts[0], velocity)), args))[0]
+            rows = zip(*(jax.tree.leaves(x) for x in (slope, velocity, parts[1])), strict=True)
+            alike = [np.isclose(a, b, rtol=1e-5) | ((a == 0) & (at_start == 0)) for a, b, at_start in rows]
+            if not all(np.all(each) for each in alike) or not any(np.any(leaf) for leaf in jax.tree.leaves(slope)):
+                return False
+    return True
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """y' = f(t, y, args) from y0 at t0 to t1."""
+
+    f: VectorField
+    y0: PyTree
+    t0: float
+    t1: float
+    args: PyTree
+    breaks: tuple[float, ...]
+
+    @property
+    def inner_breaks(self) -> tuple[float, ...]:
+        """The breaks between t0 and t1."""
+        return tuple(t for t in self.breaks if self.t0 < t < self.t1)
+
+    def max_steps(self, candidate: Candidate) -> int:
+        """Most steps of an adaptive run."""
+        size = sum(leaf.size for leaf in jax.tree.leaves(self.y0))
+        most = MOST_IMPLICIT_STEPS if candidate.program_size else MOST_STEPS
+        return min(most, max(LEAST_STEPS, WORK // max(1, size)))
+
+
+def program(candidate: Candidate, problem: Problem) -> Any:
+    """``(y0, args, t0, t1, setting) -> (y at t1, steps taken)``, NaN where it was lost or took too many steps.
+
+    setting: the number of steps, or the pair (rtol, atol).
+    """
+    if candidate.adaptive:
+        return _adaptive(candidate, problem)
+    return _diffrax_fixed(candidate, problem) if is_diffrax(candidate.step) else _fixed(candidate, problem)
+
+
+def _fixed(candidate: Candidate, problem: Problem) -> Any:
+    def run(y0, args, t0, t1, num_steps):
+        advance = advance_by(candidate.step, compensated=False)
+        if problem.breaks:
+            advance = split_at(advance, checked_breaks(problem.breaks, t0.dtype))
+        dt = (t1 - t0) / num_steps.astype(t0.dtype)
+
+        def one_step(n, carry):
+            first_nonfinite, state = carry
+            state = advance(problem.f, t0 + n.astype(dt.dtype) * dt, state, dt, args)
+            lost = (first_nonfinite < 0) & ~trees.all_finite(state[0])  # as `solve` looks for it
+            return jnp.where(lost, n, first_nonfinite), state
+
+        _, (y, _) = lax.fori_loop(0, num_steps, one_step, (jnp.int32(-1), (y0, None)))
+        return y, num_steps
+
+    return run
+
+
+def _diffrax_fixed(candidate: Candidate, problem: Problem) -> Any:
+    import diffrax
+
+    def run(y0, args, t0, t1, num_steps):
+        dt = (t1 - t0) / num_steps.astype(t0.dtype)
+        equal = diffrax.ConstantStepSize()
+        return _solved(candidate, problem, y0, args, t0, t1, dt, equal, None)
+
+    return run
+
+
+def _adaptive(candidate: Candidate, problem: Problem) -> Any:
+    if is_diffrax(candidate.step):
+        import diffrax
+
+        def run(y0, args, t0, t1, tolerances):
+            controller = diffrax.PIDController(rtol=tolerances[0], atol=tolerances[1])
+            if problem.inner_breaks:
+                jumps = jnp.asarray(problem.inner_breaks, t0.dtype)
+                controller = diffrax.ClipStepSizeController(controller, jump_ts=jumps)
+            return _solved(candidate, problem, y0, args, t0, t1, None, controller, problem.max_steps(candidate))
+
+        return run
+
+    def run_ours(y0, args, t0, t1, tolerances):
+        rtol, atol = tolerances
+        taken = solve_adaptive(
+            problem.f,
+            y0,
+            t0=t0,
+            t1=t1,
+            args=args,
+            step=candidate.step,
+            rtol=rtol,
+            atol=atol,
+            max_steps=problem.max_steps(candidate),
+            breaks=problem.breaks,
+        )
+        return jax.tree.map(lambda leaf: leaf[-1], taken.y), taken.num_steps + taken.num_rejected
+
+    return run_ours
+
+
+def _solved(candidate, problem, y0, args, t0, t1, dt0, controller, most):
+    import diffrax
+
+    run = diffrax.diffeqsolve(
+        diffrax.ODETerm(problem.f),
+        candidate.step,
+        t0,
+        t1,
+        dt0,
+        y0,
+        args,
+        stepsize_controller=controller,
+        max_steps=most,
+        throw=False,
+    )
+    reached = run.result == diffrax.RESULTS.successful
+    return jax.tree.map(lambda leaf: jnp.where(reached, leaf[-1], jnp.nan), run.ys), run.stats["num_steps"]
+
+
+def explicit_reference() -> Candidate:
+    """`solve_adaptive` as it is, or where diffrax, which has the coefficients, is not installed, by extrapolation."""
+    if has_diffrax():
+        return Candidate("solve_adaptive", None, True, "")
+    return Candidate("solve_adaptive", extrapolated_euler(6), True, "jeuler.extrapolated_euler(6)")
+
+
+def stiff_reference() -> Candidate:
+    """`solve_adaptive` by an extrapolated linearly implicit step, for stiff equations."""
+    step, base = extrapolated_euler(6, step=linearly_implicit_euler_step), "jeuler.linearly_implicit_euler_step"
+    return Candidate("solve_adaptive, linearly implicit", step, True, f"jeuler.extrapolated_euler(6, step={base})")
