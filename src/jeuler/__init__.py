@@ -1,8 +1,8 @@
 """jeuler: differentiable Euler integration of springs, particles and ODEs in JAX.
 
 The verbs stand here: `solve`, `simulate`, `fit`, `fit_springs`, `advise_step`, `advise_method`, `work_precision`,
-`stability_limit`, `diagnose`. The catalogues have a namespace each: `jeuler.forces`, `jeuler.effects`, `jeuler.contact`,
-`jeuler.samplers`, `jeuler.steps`; figures are in `jeuler.plotting`, example scenes in `jeuler.scenes`.
+`stability_limit`, `diagnose`. The catalogues have a namespace each: `jeuler.forces`, `jeuler.effects`,
+`jeuler.contact`, `jeuler.samplers`, `jeuler.steps`; figures are in `jeuler.plotting`, scenes in `jeuler.scenes`.
 """
 
 from jeuler import contact as contact
