@@ -16,7 +16,7 @@ from jeuler._core.precision import double_precision
 from jeuler.accuracy.method import has_diffrax, is_diffrax
 from jeuler.solving._adaptive import solve_adaptive
 from jeuler.solving._breaks import checked_breaks, split_at
-from jeuler.solving._scan import advance_by
+from jeuler.solving._scan import advance_by, solve
 from jeuler.steps.explicit import (
     VectorField,
     euler_step,
@@ -175,6 +175,29 @@ def _fixed(candidate: Candidate, problem: Problem) -> Any:
 
         _, (y, _) = lax.fori_loop(0, num_steps, one_step, (jnp.int32(-1), (y0, None)))
         return y, num_steps
+
+    return run
+
+
+def written_out(candidate: Candidate, problem: Problem, num_steps: int) -> Any:
+    """``(y0, args, t0, t1) -> result`` by `solve` for one number of steps, with dt as a constant of the program.
+
+    So a person writes it; XLA may make a program of another speed of it.
+    """
+
+    def run(y0, args, t0, t1):
+        found = solve(
+            problem.f,
+            y0,
+            dt=(problem.t1 - problem.t0) / num_steps,
+            num_steps=num_steps,
+            t0=problem.t0,
+            args=args,
+            step=candidate.step,
+            save_every=num_steps,
+            breaks=problem.breaks,
+        )
+        return jax.tree.map(lambda leaf: leaf[-1], found.y), found.first_nonfinite
 
     return run
 

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core.precision import cast, flat, precision
-from jeuler.accuracy.candidates import Candidate, Problem, program
+from jeuler.accuracy.candidates import Candidate, Problem, program, written_out
 from jeuler.accuracy.pilot import distance
 from jeuler.accuracy.roundoff import COUNTER
+from jeuler.accuracy.runs import is_diffrax
 
 AIM = 0.95  # of the target, that the cheapest run is to meet
 NEAR = 0.75  # of the target: an error above it ends the search between two numbers of steps
@@ -63,11 +64,24 @@ class Trial:
         self.candidate, self.problem, self.dtype = candidate, problem, np.dtype(dtype)
         self.compile_seconds, self.known = 0.0, {}
 
+    def compiled_for(self, run: Any) -> Any:
+        p = self.problem
+        with precision(self.dtype):
+            times = [jnp.asarray(t, self.dtype) for t in (p.t0, p.t1)]
+            return functools.partial(jax.jit(run), cast(p.y0, self.dtype), cast(p.args, self.dtype), *times)
+
     @functools.cached_property
     def program(self) -> Any:
-        p = self.problem
-        inputs = cast(p.y0, self.dtype), cast(p.args, self.dtype), *(jnp.asarray(t, self.dtype) for t in (p.t0, p.t1))
-        return functools.partial(jax.jit(program(self.candidate, p)), *inputs)
+        return self.compiled_for(program(self.candidate, self.problem))
+
+    def as_written(self, setting: Any) -> Any:
+        """``() -> result``: the run as the person will make it, compiled for its number of steps."""
+        if self.candidate.adaptive or is_diffrax(self.candidate.step):
+            with precision(self.dtype):
+                run = functools.partial(self.program, self.setting(setting))
+        else:
+            run = self.compiled_for(written_out(self.candidate, self.problem, setting))
+        return run
 
     def setting(self, setting: Any) -> Any:
         if self.candidate.adaptive:
@@ -80,15 +94,19 @@ class Trial:
             y, num_steps = self.program(self.setting(setting))
             return flat(y), int(num_steps)
 
-    def seconds(self, setting: Any, repeats: int) -> float:
+    def seconds(self, run: Any, repeats: int) -> float:
         """The least of so many runs."""
+        least = math.inf
         with precision(self.dtype):
-            inputs, least = self.setting(setting), math.inf
             for _ in range(repeats):
                 begun = time.perf_counter()
-                jax.block_until_ready(self.program(inputs))
+                jax.block_until_ready(run())
                 least = min(least, time.perf_counter() - begun)
         return least
+
+    def again(self, setting: Any, repeats: int) -> float:
+        with precision(self.dtype):
+            return self.seconds(functools.partial(self.program, self.setting(setting)), repeats)
 
     def outcome(self, setting: Any, truth: np.ndarray, scale: float) -> Outcome:
         """The run at a setting, timed."""
@@ -99,7 +117,7 @@ class Trial:
             final, num_steps = self.final(setting)
             seconds = time.perf_counter() - begun
             if seconds < REPEATED:
-                seconds = self.seconds(setting, 5)
+                seconds = self.again(setting, 5)
             error = distance(final, truth) / scale
             self.known[setting] = Outcome(setting, num_steps, error if math.isfinite(error) else math.inf, seconds)
         return self.known[setting]
@@ -107,7 +125,7 @@ class Trial:
     def slower_than(self, outcome: Outcome, seconds: float) -> bool:
         """Whether the run takes longer; looked at again if it seems so, as the machine may do other things beside."""
         if outcome.seconds > seconds:
-            again = self.seconds(outcome.setting, 5 if outcome.seconds < 0.1 else 1)
+            again = self.again(outcome.setting, 5 if outcome.seconds < 0.1 else 1)
             outcome = dataclasses.replace(outcome, seconds=min(again, outcome.seconds))
             self.known[outcome.setting] = outcome
         return outcome.seconds > seconds

@@ -11,7 +11,10 @@ MOST_OURS, MOST_DIFFRAX = 16_384, 4096  # max_steps of solve_adaptive and diffeq
 
 
 def code_of(candidate: Candidate, problem: Problem, setting: Any, num_steps: int, *, scene: bool) -> str:
-    """The line for a setting: a number of steps, or (rtol, atol). For a scene: of `scene` and `state`."""
+    """The line for a setting: a number of steps, or (rtol, atol). For a scene: of `scene` and `state`.
+
+    It keeps the last state only, as the runs that were timed do.
+    """
     field, state, args = "f", "y0", "" if problem.args is None else "args"
     if scene:
         field, state, args = "scene.vector_field", "scene.as_equation(state)[0]", "scene.attributes(state)"
@@ -24,7 +27,7 @@ def code_of(candidate: Candidate, problem: Problem, setting: Any, num_steps: int
         most = f", max_steps={_round_up(num_steps)}" if num_steps > MOST_OURS else ""
         end = f"{start}t1={problem.t1!r}, rtol={setting[0]!r}, atol={setting[1]!r}"
         return f"jeuler.solve_adaptive({field}, {state}, {end}{step}{most}{others})"
-    grid = f"{start}dt={(problem.t1 - problem.t0) / setting!r}, num_steps={setting}"
+    grid = f"{start}dt={(problem.t1 - problem.t0) / setting!r}, num_steps={setting}, save_every={setting}"
     if scene and not problem.breaks:
         return f"jeuler.simulate(scene, state, {grid}{step})"
     return f"jeuler.solve({field}, {state}, {grid}{step}{others})"
