@@ -24,8 +24,8 @@ from jeuler.accuracy.candidates import (
     given_candidates,
     stiff_reference,
 )
-from jeuler.accuracy.pilot import distance
 from jeuler.accuracy.method import has_diffrax
+from jeuler.accuracy.pilot import distance
 from jeuler.accuracy.trials import Found, Target, Trial, cheapest, milliseconds
 from jeuler.accuracy.written import code_of
 from jeuler.particles.fields import name_of
