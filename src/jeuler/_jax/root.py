@@ -26,6 +26,7 @@ def root(
     guess: Array,
     solve: Callable[[Callable, Array], tuple[Array, Any]],
     tangent_solve: Callable[[Callable, Array], Array],
+    label: str = "",
 ) -> tuple[Array, Any]:
     """x with f(x) = 0, differentiable in whatever f closes over.
 
@@ -36,6 +37,7 @@ def root(
       guess: where the solver starts; the root does not depend on it.
       solve: ``solve(f, guess) -> (x, info)``; it is not differentiated. info: arrays, without derivative.
       tangent_solve: ``tangent_solve(matvec, b) -> x`` with matvec(x) = b; differentiated to higher order.
+      label: of the equation, for the policy of a ``jax.checkpoint`` that keeps some roots.
     Returns: the pair (x, info).
     """
 
@@ -62,7 +64,11 @@ def root(
         for p, c, x in zip(traced, consts, extra, strict=True)
     )
     x, *info = root_p.bind(
-        lax.stop_gradient(guess), *(c for cs in consts for c in cs), programs=programs, sizes=tuple(map(len, consts))
+        lax.stop_gradient(guess),
+        *(c for cs in consts for c in cs),
+        programs=programs,
+        sizes=tuple(map(len, consts)),
+        label=label,
     )
     return x, jax.tree.unflatten(trees["info"], info)
 
@@ -74,20 +80,20 @@ def _split(operands: Any, sizes: tuple[int, ...]) -> list[tuple]:
 
 
 @root_p.def_impl
-def _run(guess, *consts, programs, sizes):
+def _run(guess, *consts, programs, sizes, label):
     return evaluate(programs[0], [*_split(consts, sizes)[0], guess])
 
 
 @root_p.def_abstract_eval
-def _avals(guess, *consts, programs, sizes):
+def _avals(guess, *consts, programs, sizes, label):
     return programs[0].out_avals
 
 
 mlir.register_lowering(root_p, mlir.lower_fun(_run, multiple_results=True))
 
 
-def _jvp(primals, tangents, *, programs, sizes):
-    x, *info = root_p.bind(*primals, programs=programs, sizes=sizes)
+def _jvp(primals, tangents, *, programs, sizes, label):
+    x, *info = root_p.bind(*primals, programs=programs, sizes=sizes, label=label)
     no_tangents = [ad.Zero(jax.typeof(i).to_tangent_aval()) for i in info]
     (_, of_f, of_tangent_solve), (_, f_dot, _) = _split(primals[1:], sizes), _split(tangents[1:], sizes)
     moving = [n for n, dot in enumerate(f_dot) if type(dot) is not ad.Zero]
@@ -108,7 +114,7 @@ def _jvp(primals, tangents, *, programs, sizes):
 ad.primitive_jvps[root_p] = _jvp
 
 
-def _batch(operands, axes, *, programs, sizes):
+def _batch(operands, axes, *, programs, sizes, label):
     size = next(x.shape[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
     guess, *consts = operands
     axis = axes[0]
@@ -120,7 +126,7 @@ def _batch(operands, axes, *, programs, sizes):
 
     parts = zip(programs, _split(consts, sizes), _split(axes[1:], sizes), (1, 1, 2), strict=True)
     programs = tuple(batched(program, c, a, *[guess] * n) for program, c, a, n in parts)
-    out = root_p.bind(guess, *consts, programs=programs, sizes=sizes)
+    out = root_p.bind(guess, *consts, programs=programs, sizes=sizes, label=label)
     return out, [0] * len(out)
 
 

@@ -27,6 +27,7 @@ class Look(NamedTuple):
     speed: Array  # (contact, dim), relative dx/ds of the partners, m a step
 
 
+@jax.tree_util.register_pytree_node_class
 class Contacts:
     """The contacts of one step: first each collider with all particles, in their order, then the pairs.
 
@@ -46,6 +47,18 @@ class Contacts:
         self.listed = jnp.ones(len(self.i), bool)
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        sizes = ("particles", "dim")
+        names = tuple(name for name in vars(self) if name not in sizes)
+        return tuple(getattr(self, name) for name in names), (names, self.particles, self.dim)
+
+    @classmethod
+    def tree_unflatten(cls, kept: tuple[Any, ...], values: tuple[Any, ...]) -> Contacts:
+        self = object.__new__(cls)
+        names, self.particles, self.dim = kept
+        vars(self).update(zip(names, values, strict=True))
+        return self
 
     @property
     def walls(self) -> int:
@@ -96,23 +109,20 @@ class Contacts:
         """join(y of the first, y of the second), where there is no second y of the first; y is (particle,)."""
         return jnp.concatenate([*[y] * len(self.colliders), *([join(y[self.i], y[self.j])] if len(self.i) else [])])
 
-    def response(self) -> Array:
-        """The change of the relative velocity by a unit of impulse, (contact,), 1/kg."""
-        return self.both(jnp.add, self.inverse_mass)
-
-    def gather(self, per_contact: Array) -> Array:
-        """The sum of what contacts give: added to the first partner, taken from the second; (particle, ...)."""
-        total = jnp.zeros((self.particles, *per_contact.shape[1:]), per_contact.dtype)
+    def move(self, change: Array) -> Array:
+        """The changes (particle, ...) by impulses that change the relative velocity by (contact, ...) if alone."""
+        movable = self.inverse_mass > 0
+        total = jnp.zeros((self.particles, *change.shape[1:]), change.dtype)
         for k in range(len(self.colliders)):
-            total = total + per_contact[k * self.particles : (k + 1) * self.particles]
+            total = total + change[k * self.particles : (k + 1) * self.particles]
+        total = jnp.where(movable.reshape(-1, *[1] * (change.ndim - 1)), total, 0)
         if len(self.i):
-            pairs = per_contact[self.walls :]
-            total = total.at[self.i].add(pairs).at[self.j].add(-pairs)
+            first, second = self.inverse_mass[self.i], self.inverse_mass[self.j]
+            response = jnp.where(first + second > 0, first + second, 1)
+            pairs = change[self.walls :]
+            for body, part in ((self.i, first / response), (self.j, -second / response)):
+                total = total.at[body].add(part.reshape(-1, *[1] * (change.ndim - 1)) * pairs)
         return total
-
-    def push(self, impulse: Array) -> Array:
-        """The changes of velocity, (particle, dim), by impulses (contact, dim) on the first partners."""
-        return self.inverse_mass[:, None] * self.gather(impulse)
 
     def look(self, path: Path, s: Array) -> Look:
         """What there is to know of each contact where its partners are at its own s."""

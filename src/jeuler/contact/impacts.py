@@ -6,6 +6,7 @@ then gone through again, with the time of each impact as a function of the paths
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -13,12 +14,13 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core.vectors import length
-from jeuler.contact.contacts import Contacts
+from jeuler._jax.anywhere import anywhere
+from jeuler._jax.root import root
+from jeuler.contact.contacts import Contacts, Look
 from jeuler.contact.paths import Path, along
 
 MAX_STRIDES = 400  # along one path; one that grazes a surface that is not known to be convex needs many
 NEWTON_STEPS = 5
-REFINEMENTS = 2  # of Newton's method from the root: derivatives of the root are right up to the third
 
 
 class Events(NamedTuple):
@@ -37,6 +39,7 @@ class Found(NamedTuple):
     at_root: Array
     plastic: Array
     given_up: Array  # whether the search ended before it was clear
+    look: Look  # at s
 
 
 def bounce(v: Array, normal: Array, restitution: Any, friction: Any) -> Array:
@@ -96,11 +99,12 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     searched = contacts.possible() & (now | (first.gap <= stride))
 
     def go_on(state):
-        s, _, _, _, newtons, n = state
+        s, _, _, newtons, n = state
         return jnp.any(searched & (newtons < NEWTON_STEPS) & (s <= 1)) & (n < MAX_STRIDES)
 
     def advance(state):
-        s, gap, slope, apart, newtons, n = state
+        s, look, apart, newtons, n = state
+        gap, slope = look.gap, look.slope
         far = apart & ((gap > 1e-3 * stride) | (slope >= 0)) & (gap > 0) & (newtons == 0)
         ahead = jnp.maximum(gap / safe_stride, jnp.where(slope >= 0, 0.02, 0))  # away from it not too slowly
         longer = convex_stride(jnp.maximum(gap, 0), slope, turn)
@@ -111,16 +115,18 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
         newtons = newtons + jnp.where((n > 0) & ~far, 1, 0)
         look = contacts.look(path, s)
         apart = jnp.where(n == 0, ~now & (look.gap > small), apart)
-        return s, look.gap, look.slope, apart, jnp.where(now | apart, newtons, NEWTON_STEPS), n + 1
+        return s, look, apart, jnp.where(now | apart, newtons, NEWTON_STEPS), n + 1
 
     begin = start + jnp.where(touching & ~now, 1e-3, 0)  # who leaves may come back
-    state = begin, first.gap, first.slope, now, jnp.zeros(contacts.count, jnp.int32), 0
-    s, gap, slope, apart, newtons, _ = lax.while_loop(go_on, advance, state)
+    state = begin, first, now, jnp.zeros(contacts.count, jnp.int32), 0
+    s, look, apart, newtons, _ = lax.while_loop(go_on, advance, state)
     given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
-    at_root = (slope < 0) & (jnp.abs(gap) <= small + 1e-6 * stride) & (s > lowest)
+    at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small + 1e-6 * stride) & (s > lowest)
     happens = searched & (now | (apart & at_root & (s <= 1)))
-    s = jnp.where(now & ~at_root, start, s)
-    return Found(jnp.where(happens, s, jnp.inf), at_root, ~now & (-slope <= limit), given_up)
+    overlap = now & ~at_root
+    look = jax.tree.map(lambda x, y: jnp.where(overlap if x.ndim == 1 else overlap[:, None], x, y), first, look)
+    s = jnp.where(overlap, start, s)
+    return Found(jnp.where(happens, s, jnp.inf), at_root, ~now & (-look.slope <= limit), given_up, look)
 
 
 def choose(contacts: Contacts, found: Found) -> Events:
@@ -150,37 +156,39 @@ def choose(contacts: Contacts, found: Found) -> Events:
     return Events(contact, jnp.where(there, found.s[of], 0), there & found.at_root[of], there & found.plastic[of])
 
 
-def apply(contacts: Contacts, path: Path, events: Events, theta: Array, refinements: int = 0) -> Path:
-    """The paths after the impacts of one round; differentiable, with refinements the times of the impacts included."""
-    met = contacts.first(events.contact) == jnp.arange(contacts.count)
+def meet(contacts: Contacts, path: Path, events: Events) -> tuple[Array, Look]:
+    """The time of each contact's impact as a function of the paths, and what there is to know of it then.
+
+    gap(path, s) = 0,   in an overlap s is that of the later last impact of its partners
+    """
     start = contacts.both(jnp.maximum, path.s)
-    follows = met & contacts.first(events.at_root)
-    s = jnp.where(follows, lax.stop_gradient(contacts.first(events.s)), start)
+    at_root = met(contacts, events) & contacts.first(events.at_root)
 
-    def refine(state, _):
-        s, last = state
-        falls = follows & (last.slope < 0)
-        s = jnp.where(falls, s - last.gap / jnp.where(falls, last.slope, -1), s)
-        return (s, contacts.look(path, s)), None
+    def gap(s):
+        return jnp.where(at_root, contacts.look(path, s).gap, s - start)
 
-    if refinements:
-        blank = jax.tree.map(jnp.zeros_like, jax.eval_shape(contacts.look, path, s))
-        (s, look), _ = lax.scan(refine, (s, blank), length=refinements + 1)
-    else:
-        look = contacts.look(path, s)
+    known = jnp.where(at_root, contacts.first(events.s), start)
+    s, _ = root(gap, known, lambda _, s: (s, ()), lambda slope, b: b / slope(jnp.ones_like(b)))
+    return s, contacts.look(path, s)
 
+
+def met(contacts: Contacts, events: Events) -> Array:
+    """Which contacts have their impact in this round."""
+    return contacts.first(events.contact) == jnp.arange(contacts.count)
+
+
+def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look, theta: Array) -> Path:
+    """The paths after the impacts of one round, each at its s, (contact,)."""
+    now, plastic = met(contacts, events), contacts.first(events.plastic)
     normal, bend = look.normal, contacts.relative(path.bend)
     v = look.speed / contacts.dt + look.recession[:, None] * normal
-    plastic = contacts.first(events.plastic)
     change = bounce(v, normal, jnp.where(plastic, 0, contacts.restitution), contacts.friction)
     into = jnp.sum(bend * normal, axis=-1)
     held = jnp.where(plastic & (into < 0), -into, 0)[:, None] * normal  # no more push into what it stays on
 
-    response = contacts.response()
-    per_mass = jnp.where(met & (response > 0), 1 / jnp.where(response > 0, response, 1), 0)[:, None]
-    both = contacts.push(per_mass * jnp.concatenate([change, held], axis=1))
+    both = contacts.move(jnp.where(now[:, None], jnp.concatenate([change, held], axis=1), 0))
     kick, hold = both[:, : contacts.dim], both[:, contacts.dim :]
-    own_s = spread(contacts, path.s, s, met)
+    own_s = spread(contacts, path.s, s, now)
     hit = (events.contact >= 0)[:, None]
     late = (1 - own_s)[:, None] + 0.5 - theta
     speed = jnp.where(hit, path.speed(own_s) + contacts.dt * kick, path.way)
@@ -217,8 +225,9 @@ def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Arra
     return y
 
 
-def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: int) -> tuple[Events, Array]:
-    """The impacts of all rounds and of one more, which rest, each leaf (round, particle); and the number of these."""
+def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: int) -> tuple[Events, Path, Array]:
+    """The impacts of all rounds and of one more, which rest, each leaf (round, particle); the paths after them; and the
+    number of impacts that were made to rest."""
     none = jnp.full(contacts.particles, -1, jnp.int32)
     no = jnp.zeros(contacts.particles, bool)
     empty = Events(none, jnp.zeros_like(path.s), no, no)
@@ -233,24 +242,30 @@ def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: 
         stopped = (k == rounds) & jnp.isfinite(found.s) & ~found.plastic
         left = left + jnp.sum(found.given_up | stopped).astype(jnp.int32)
         record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)
-        return apply(contacts, path, events, theta), record, k + 1, any_left, left
+        path = strike(contacts, path, events, found.s, found.look, theta)
+        return path, record, k + 1, any_left, left
 
     def go_on(state):
         _, _, k, any_left, _ = state
         return any_left & (k <= rounds)
 
     start = path, record, jnp.int32(0), jnp.asarray(True), jnp.int32(0)
-    _, record, _, _, left = lax.while_loop(go_on, one, start)
-    return record, left
+    path, record, _, _, left = lax.while_loop(go_on, one, start)
+    return record, path, left
 
 
 def go_through(contacts: Contacts, path: Path, events: Events, theta: Array) -> Path:
-    """The paths after all rounds of a schedule."""
+    """The paths after all rounds of a schedule, differentiable; rounds without an impact cost nothing."""
 
+    recomputed = functools.partial(jax.checkpoint, prevent_cse=False)
+
+    @recomputed
+    def again(path, events):
+        return strike(contacts, path, events, *meet(contacts, path, events), theta)
+
+    @recomputed
     def one(path, events):
-        happens = jnp.any(events.contact >= 0)
-        return lax.cond(
-            happens, lambda path: apply(contacts, path, events, theta, REFINEMENTS), lambda path: path, path
-        ), None
+        happens = anywhere(events.contact >= 0)
+        return lax.cond(happens, again, lambda path, _: path, path, events), None
 
     return lax.scan(one, path, events)[0]

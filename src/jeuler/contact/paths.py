@@ -50,7 +50,8 @@ def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = 0.0
 
 
 def along(y: Array, support: Array) -> Array:
-    """The component of y along the support, (particle,)."""
+    """The component of y along the support, (particle,); it only decides what happens, and is not differentiated."""
+    y, support = lax.stop_gradient((y, support))
     return jnp.sum(y * unit(support), axis=-1)
 
 

@@ -11,59 +11,113 @@ point of a projection (P. Alart, A. Curnier, 1991)
 
 it is iterated with Nesterov's acceleration and restarts (H. Mazhar et al., ACM Transactions on Graphics 34, 2015, who
 do so on the friction cone), r the inverse of each contact's response, split among the contacts of a ball (R. Tonge et
-al., ACM Transactions on Graphics 31, 2012). One step of Newton's method on the same equation ends it, and gives the
-derivatives: those of the implicit function theorem on the active set.
+al., ACM Transactions on Graphics 31, 2012). The unknowns are changes of velocity w, m/s: what each impulse does to the
+relative velocity of its partners if it is alone. Displacements that leave no overlap are a linear system for one more
+unknown of each contact. One step of Newton's method on all these equations ends it; derivatives are those of the
+implicit function theorem on the active set.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.ad_checkpoint import checkpoint_name
 
 from jeuler._core.vectors import length
+from jeuler._jax.anywhere import anywhere
+from jeuler._jax.root import root
 from jeuler.contact.contacts import Contacts
 
-DENSE_UP_TO = 64  # unknowns; beyond, matrix-free
+DENSE_UP_TO = 96  # unknowns; beyond, matrix-free
 ITERATIONS = 400
+REFINEMENTS = 3
+REST = "contacts at rest"
 
 
-class Forces(NamedTuple):
-    """The impulses of a step, (contact, dim), N s, and which contacts they did not bring to rest."""
+class Rest(NamedTuple):
+    """What the contacts at rest do in a step."""
 
-    impulse: Array
-    unresolved: Array  # (), int32
+    kick: Array  # (particle, dim), what they add to the velocity, m/s
+    shift: Array  # (particle, dim), by which they close overlaps, m
+    on: Array  # (contact,), which of them act
+    gap: Array  # (contact,), at the end of the step, where they act, m
+    unresolved: Array  # (), int32, how many of them still move into each other
 
 
-def contact_forces(contacts: Contacts, normal: Array, velocity: Array, active: Array) -> Forces:
-    """The impulses p of the contacts that are active, for relative velocities (contact, dim) without them."""
-    friction, response = contacts.friction, contacts.response()
-    shares = contacts.both(jnp.maximum, _number_of_contacts(contacts, active))
-    rate = jnp.where(response > 0, 1 / jnp.where(response > 0, response * shares, 1), 0)[:, None]
+class Problem(NamedTuple):
+    """The equations of the contacts at rest."""
 
-    def project(y):
-        y_n = jnp.sum(y * normal, axis=-1, keepdims=True)
-        push = jnp.where(active[:, None] & (y_n > 0), y_n, 0)
-        y_t = y - y_n * normal
-        size, most = length(y_t)[:, None], friction * push
-        return push * normal + jnp.where(size <= most, y_t, y_t * (most / jnp.where(size > most, size, 1)))
+    contacts: Contacts
+    normal: Array  # (contact, dim)
+    velocity: Array  # (contact, dim), relative, at the end of the step without contact, m/s
+    gap: Array  # (contact,), at the end of the step without contact, over dt, m/s
+    theta: Array  # (particle, 1), share of a kick that moves the particle in this step
+    active: Array  # (contact,)
 
-    def improve(p, velocity):
-        return project(p - rate * (velocity + contacts.relative(contacts.push(p))))
+    def along(self, y: Array) -> Array:
+        """The normal component of the relative y, (contact,), of y (particle, dim)."""
+        return jnp.sum(self.contacts.relative(y) * self.normal, axis=-1)
+
+    def push(self, w: Array) -> Array:
+        """The normal component of w, (contact,), m/s."""
+        return jnp.sum(w * self.normal, axis=-1)
+
+    def project(self, y: Array) -> Array:
+        """The impulse nearest to y that pushes, and rubs no more than friction can."""
+        y_n = self.push(y)[:, None]
+        push = jnp.where(self.active[:, None] & (y_n > 0), y_n, 0)
+        y_t = y - y_n * self.normal
+        size, most = length(y_t)[:, None], self.contacts.friction * push
+        held = size < most  # strictly: friction 0 holds nothing
+        return push * self.normal + jnp.where(held, y_t, y_t * (most / jnp.where(held | (size == 0), 1, size)))
+
+    def improve(self, w: Array, kick: Array, rate: Array) -> Array:
+        """The projection of which the impulses w, which give the kick, are a fixed point."""
+        return self.project(w - rate[:, None] * (self.velocity + self.contacts.relative(kick)))
+
+    def gap_after(self, kick: Array) -> Array:
+        return self.gap + self.along(self.theta * kick)
+
+    def shift(self, q: Array) -> Array:
+        return self.contacts.move(q[:, None] * self.normal)
+
+    def residual(self, u: Array, rate: Array, on: Array) -> Array:
+        """What is to be 0: u holds the w of each contact, and its displacement q over dt."""
+        w, q = u[:, :-1], u[:, -1]
+        kick = self.contacts.move(w)
+        closed = jnp.where(on, self.gap_after(kick) + self.along(self.shift(q)), q)
+        return jnp.concatenate([w - self.improve(w, kick, rate), closed[:, None]], axis=1)
+
+
+def at_rest(problem: Problem, small: Array) -> Rest:
+    """The answer of the contacts that are active. Overlaps of ``small``, (contact,), m, are none."""
+    contacts, active = problem.contacts, problem.active
+    small = small / contacts.dt
+
+    def acting(w, kick):
+        return lax.stop_gradient(active & ((problem.push(w) > 0) | (problem.gap_after(kick) < -small)))
 
     if len(contacts.colliders) == 1 and not len(contacts.i):  # each particle for itself: exact at once
-        return Forces(improve(jnp.zeros_like(velocity), velocity), jnp.int32(0))
-    p, error = _iterate(improve, rate, lax.stop_gradient(velocity))
-    scale = jnp.max(jnp.where(active, length(velocity), 0), initial=0)
-    rounding = 64 * jnp.finfo(velocity.dtype).eps * jnp.max(length(velocity), initial=0)
-    unresolved = jnp.sum(active & (error > 1e-3 * scale + rounding)).astype(jnp.int32)
-    return Forces(_newton(lambda p: p - improve(p, velocity), p), unresolved)
+        w = problem.project(-problem.velocity)
+        on, unresolved = acting(w, w), jnp.int32(0)
+        u = jnp.concatenate([w, jnp.where(on, -problem.gap_after(w), 0)[:, None]], axis=1)
+    else:
+        rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, active))
+        w, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate), REST)
+        unresolved = jnp.sum(active & (error > _tolerated(problem))).astype(jnp.int32)
+        on = acting(w, contacts.move(w))
+        u = _solve(lambda u: problem.residual(u, rate, on), jnp.pad(w, ((0, 0), (0, 1))), anywhere(active))
+    kick, q = contacts.move(u[:, :-1]), u[:, -1]
+    gap = problem.gap_after(kick) + problem.along(problem.shift(q))
+    return Rest(kick, contacts.dt * problem.shift(q), on, jnp.where(on, contacts.dt * gap, 0), unresolved)
 
 
 def _number_of_contacts(contacts: Contacts, active: Array) -> Array:
-    one = jnp.where(active, 1.0, 0.0).astype(contacts.radius.dtype)
+    one = active.astype(contacts.radius.dtype)
     total = jnp.zeros_like(contacts.radius)
     for k in range(len(contacts.colliders)):
         total = total + one[k * contacts.particles : (k + 1) * contacts.particles]
@@ -72,21 +126,26 @@ def _number_of_contacts(contacts: Contacts, active: Array) -> Array:
     return jnp.maximum(total, 1)
 
 
-def _iterate(improve: Any, rate: Array, velocity: Array) -> tuple[Array, Array]:
-    """The fixed point by accelerated iterations, and what is left of each contact's velocity; not differentiated."""
-    improve, rate = lax.stop_gradient((jax.tree_util.Partial(improve), rate))
-    eps = jnp.finfo(velocity.dtype).eps
-    enough = jnp.maximum(1e-9, 30 * eps) * jnp.max(length(velocity), initial=0)
-    safe_rate = jnp.where(rate > 0, rate, 1)
+def _tolerated(problem: Problem) -> Array:
+    """The velocity of a contact, m/s, that counts as none."""
+    speed = length(lax.stop_gradient(problem.velocity))
+    rounding = 64 * jnp.finfo(speed.dtype).eps * jnp.max(speed, initial=0)
+    return 1e-3 * jnp.max(jnp.where(problem.active, speed, 0), initial=0) + rounding
+
+
+def _iterate(problem: Problem, rate: Array) -> tuple[Array, Array]:
+    """The fixed point by accelerated iterations, and what is left of each contact's velocity."""
+    velocity = problem.velocity
+    enough = jnp.maximum(1e-9, 30 * jnp.finfo(velocity.dtype).eps) * jnp.max(length(velocity), initial=0)
 
     def one(state):
-        p, ahead, weight, _, k = state
-        new = improve(ahead, velocity)
-        restart = jnp.sum((ahead - new) * (new - p)) > 0
+        w, ahead, weight, _, k = state
+        new = problem.improve(ahead, problem.contacts.move(ahead), rate)
+        restart = jnp.sum((ahead - new) * (new - w)) > 0
         weight = jnp.where(restart, 1.0, weight).astype(velocity.dtype)
         next_weight = (1 + jnp.sqrt(1 + 4 * weight**2)) / 2
-        error = jnp.where(rate[:, 0] > 0, length((new - ahead) / safe_rate), 0)
-        ahead = new + jnp.where(restart, 0, (weight - 1) / next_weight) * (new - p)
+        error = length(new - ahead) / rate
+        ahead = new + jnp.where(restart, 0, (weight - 1) / next_weight) * (new - w)
         return new, ahead, next_weight, error, k + 1
 
     def go_on(state):
@@ -94,71 +153,54 @@ def _iterate(improve: Any, rate: Array, velocity: Array) -> tuple[Array, Array]:
         return (jnp.max(error, initial=0) > enough) & (k < ITERATIONS)
 
     zero = jnp.zeros_like(velocity)
-    start = zero, zero, jnp.ones((), velocity.dtype), jnp.full(len(velocity), jnp.inf, velocity.dtype), 0
-    p, _, _, error, _ = lax.while_loop(go_on, one, start)
-    return p, error
+    error = jnp.where(problem.active, jnp.inf, jnp.zeros_like(rate))
+    w, _, _, error, _ = lax.while_loop(go_on, one, (zero, zero, jnp.ones((), velocity.dtype), error, 0))
+    return w, error
 
 
-def _newton(residual: Any, p: Array) -> Array:
-    """p after one step of Newton's method, as a function of all that the residual depends on."""
-    p = lax.stop_gradient(p)
-    value, slope = jax.linearize(residual, p)
-    if p.size > DENSE_UP_TO:
+def _solve(residual: Callable[[Array], Array], guess: Array, needed: Array) -> Array:
+    """The root of the residual, one step of Newton's method away from the guess; the guess where none is needed."""
+
+    def newton(residual, guess):
+        def step(_):
+            value, slope = jax.linearize(residual, guess)
+            if guess.size > DENSE_UP_TO:  # w is right to the tolerance of the iteration: only the gaps are closed
+                value = value.at[:, :-1].set(0)
+            return guess - _solve_linear(slope, value)
+
+        return lax.cond(needed, step, lambda _: guess, None), ()
+
+    def tangent_solve(slope, b):
+        return lax.cond(needed, lambda b: _solve_linear(slope, b), lambda b: b, b)
+
+    return root(residual, guess, newton, tangent_solve, label=REST)[0]
+
+
+def _solve_linear(slope: Callable[[Array], Array], b: Array) -> Array:
+    """slope^-1 b, by least squares; where contacts are redundant, some forces that do the same."""
+    if b.size > DENSE_UP_TO:
         from jax.scipy.sparse.linalg import bicgstab
 
-        # p is the solution to the tolerance of the iteration; the linear solve is for the derivatives alone
-        step, _ = bicgstab(slope, value - lax.stop_gradient(value), tol=1e-9, maxiter=200)
-        return p - step
-    return p - _dense_solve(slope, value)
-
-
-def _dense_solve(slope: Any, value: Array) -> Array:
-    """slope^-1 value, by least squares; where contacts are redundant, some forces that do the same."""
-    n = value.size
-    columns = jax.vmap(lambda d: slope(d.reshape(value.shape)).ravel())(jnp.eye(n, dtype=value.dtype))
-    matrix = columns.T
-    small = 1e3 * jnp.finfo(value.dtype).eps * jnp.eye(n, dtype=value.dtype)
+        return bicgstab(slope, b, tol=1e-9, maxiter=200)[0]
+    n = b.size
+    matrix = jax.vmap(lambda d: slope(d.reshape(b.shape)).ravel())(jnp.eye(n, dtype=b.dtype)).T
+    small = 1e3 * jnp.finfo(b.dtype).eps * jnp.eye(n, dtype=b.dtype)
 
     def least_squares(m):
+        half = lax.linalg.cholesky(m.T @ m + small)
+
         def solve(_, b):
-            half = lax.linalg.cholesky(m.T @ m + small)
-            y = lax.linalg.triangular_solve(half, (m.T @ b)[:, None], left_side=True, lower=True)
-            return lax.linalg.triangular_solve(half, y, left_side=True, lower=True, transpose_a=True)[:, 0]
+            def refine(_, x):
+                y = (m.T @ (b - m @ x))[:, None]
+                y = lax.linalg.triangular_solve(half, y, left_side=True, lower=True)
+                return x + lax.linalg.triangular_solve(half, y, left_side=True, lower=True, transpose_a=True)[:, 0]
+
+            return lax.fori_loop(0, 1 + REFINEMENTS, refine, jnp.zeros_like(b))
 
         return solve
 
     fixed = lax.stop_gradient(matrix)
     solved = lax.custom_linear_solve(
-        lambda d: matrix @ d, value.ravel(), least_squares(fixed), transpose_solve=least_squares(fixed.T)
+        lambda d: matrix @ d, b.ravel(), least_squares(fixed), transpose_solve=least_squares(fixed.T)
     )
-    return solved.reshape(value.shape)
-
-
-def displacements(contacts: Contacts, normal: Array, gap: Array, on: Array) -> tuple[Array, Array]:
-    """The displacements (particle, dim) that close the gaps of the contacts in ``on``, (contact,), and what is left.
-
-    q with  gap + n.(displacement by q n) = 0,   displacement = M^-1 J^T q: the least in the metric of the masses.
-    """
-
-    def opened(q):
-        return jnp.sum(contacts.relative(contacts.push(q[:, None] * normal)) * normal, axis=-1)
-
-    response = contacts.response()
-    safe = jnp.where(on & (response > 0), response, 1)
-    target = jnp.where(on, -gap, 0)
-    if len(contacts.colliders) == 1 and not len(contacts.i):
-        q = jnp.where(on, target / safe, 0)
-        return contacts.push(q[:, None] * normal), jnp.zeros_like(gap)
-
-    def system(q):  # in units of the displacement that a contact alone would need
-        return jnp.where(on, opened(jnp.where(on, q / safe, 0)), q)
-
-    if gap.size > DENSE_UP_TO:
-        from jax.scipy.sparse.linalg import bicgstab
-
-        q, _ = bicgstab(system, target, tol=1e-6, maxiter=60)
-    else:
-        q = _dense_solve(system, target)
-    moved = contacts.push(jnp.where(on, q / safe, 0)[:, None] * normal)
-    left = jnp.where(on, gap + jnp.sum(contacts.relative(moved) * normal, axis=-1), 0)
-    return moved, left
+    return solved.reshape(b.shape)
