@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.annotations import ColliderLike, Parameter, default
@@ -14,7 +16,7 @@ from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import component, store_as_float
 from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.contact.contacts import Contacts
-from jeuler.contact.within_step import resolve
+from jeuler.contact.within_step import answer, resolve
 
 
 @component(static=("pairs", "max_bounces"), positive=("radius", "restitution", "friction"))
@@ -28,8 +30,9 @@ class Collisions:
     motion, and a thin obstacle is not missed. What touches at the start of a step and does not come together faster
     than the forces of one step can make it rests: contact forces hold it through the step, stacks and piles too.
     Overlaps of what rests are closed by displacements. What could not be resolved is counted in
-    ``Solution.unresolved_contacts``. Particles do not collide with each other unless ``pairs`` names them. Pinned
-    particles (mass = inf) and prescribed ones are never moved. Where a signed distance is NaN, so is the particle.
+    ``Solution.unresolved_contacts``. Beside the library's implicit steps what rests is part of the solve. Particles do
+    not collide with each other unless ``pairs`` names them. Pinned particles (mass = inf) and prescribed ones are never
+    moved. Where a signed distance is NaN, so is the particle.
 
     Args:
       colliders: `Plane`, `Sphere`, `Box`, or any signed distance ``(t, point) -> ()``; a tuple.
@@ -92,6 +95,12 @@ class Collisions:
         before = state.unresolved_contacts
         count = before if before is None else before + unresolved
         return dataclasses.replace(state, position=position, velocity=velocity, unresolved_contacts=count)
+
+    def answer(self, t: Any, dt: Any, state: Any, acceleration: Array) -> Callable[[Array], Array]:
+        """What contacts at rest add to the velocities at the end of a step from this state, given these velocities."""
+        x = state.position
+        contacts = Contacts(self, jnp.asarray(t), jnp.asarray(dt), x, state.mass, state.alive)
+        return answer(contacts, x, state.velocity, acceleration)
 
     @property
     def writes(self) -> tuple[str, ...]:

@@ -107,8 +107,8 @@ def at_rest(problem: Problem, small: Array) -> Rest:
         u = jnp.concatenate([w, jnp.where(on, -problem.gap_after(w), 0)[:, None]], axis=1)
     else:
         rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, active))
-        w, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate), REST)
-        unresolved = jnp.sum(active & (error > _tolerated(problem))).astype(jnp.int32)
+        w, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate, small), REST)
+        unresolved = jnp.sum(active & (error > _tolerated(problem) + small)).astype(jnp.int32)
         on = acting(w, contacts.move(w))
         u = _solve(lambda u: problem.residual(u, rate, on), jnp.pad(w, ((0, 0), (0, 1))), anywhere(active))
     kick, q = contacts.move(u[:, :-1]), u[:, -1]
@@ -127,16 +127,17 @@ def _number_of_contacts(contacts: Contacts, active: Array) -> Array:
 
 
 def _tolerated(problem: Problem) -> Array:
-    """The velocity of a contact, m/s, that counts as none."""
+    """The velocity of a contact, m/s, that counts as none beside those of the problem."""
     speed = length(lax.stop_gradient(problem.velocity))
     rounding = 64 * jnp.finfo(speed.dtype).eps * jnp.max(speed, initial=0)
     return 1e-3 * jnp.max(jnp.where(problem.active, speed, 0), initial=0) + rounding
 
 
-def _iterate(problem: Problem, rate: Array) -> tuple[Array, Array]:
-    """The fixed point by accelerated iterations, and what is left of each contact's velocity."""
+def _iterate(problem: Problem, rate: Array, small: Array) -> tuple[Array, Array]:
+    """The fixed point by accelerated iterations, and what is left of each contact's velocity; ``small`` is none."""
     velocity = problem.velocity
     enough = jnp.maximum(1e-9, 30 * jnp.finfo(velocity.dtype).eps) * jnp.max(length(velocity), initial=0)
+    enough = enough + 0.01 * jnp.min(small, initial=jnp.inf)
 
     def one(state):
         w, ahead, weight, _, k = state

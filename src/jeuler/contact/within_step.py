@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,7 +13,7 @@ from jax.ad_checkpoint import checkpoint_name
 
 from jeuler._core.vectors import length
 from jeuler._jax.found import found, found_p
-from jeuler.contact.contacts import Contacts
+from jeuler.contact.contacts import Contacts, Look
 from jeuler.contact.impacts import go_through, impulsive_limit, schedule
 from jeuler.contact.paths import Path, free_path, share_of_the_force
 from jeuler.contact.rest import REST, Problem, at_rest
@@ -40,7 +41,7 @@ def _resolve(
     displacement, dv = x_free - x, v_free - v
     theta = share_of_the_force(displacement, v, dv, contacts.dt)
     contacts.near(free_path(x, displacement, dv, contacts.dt))
-    slow = 1e-3 * contacts.dt * contacts.both(jnp.add, length(lax.stop_gradient(dv)))
+    slow = _slow(contacts, dv)
 
     path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow)
     contacts.lift_off(path)
@@ -54,6 +55,30 @@ def _resolve(
     return position, velocity, unresolved + left + contacts.left_out
 
 
+def _slow(contacts: Contacts, dv: Array) -> Array:
+    """An approach, (contact,), m a step, that is none beside what forces do in a step."""
+    return 1e-3 * contacts.dt * contacts.both(jnp.add, length(lax.stop_gradient(dv)))
+
+
+def answer(contacts: Contacts, x: Array, v: Array, acceleration: Array) -> Callable[[Array], Array]:
+    """What contacts at rest add to velocities (particle, dim) at the end of a step from (x, v), as a function of these.
+
+    For steps that solve for their end: u = v + dt a(x + dt u, u) + answer(v + dt a(x + dt u, u)). The acceleration
+    without contact, at the start, says how fast an approach the forces of a step make.
+    """
+    dv = contacts.dt * acceleration
+    path = free_path(x, contacts.dt * (v + dv / 2), dv, contacts.dt)
+    contacts.near(path)
+    (gap, _, normal, recession, _), small, stays = at_start(contacts, path, _slow(contacts, dv))
+    standing = jnp.zeros((len(x), 1), x.dtype)
+
+    def kick(u):
+        velocity = contacts.relative(u) + recession[:, None] * normal
+        return at_rest(Problem(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays), small).kick
+
+    return kick
+
+
 def _end(path: Path) -> tuple[Array, Array]:
     """The positions at the end of the step, and what impacts have added to the velocities."""
     return path.position(jnp.ones_like(path.s)), path.jump
@@ -64,13 +89,7 @@ def hold(
 ) -> tuple[Path, Array, Array, Array, Array]:
     """The paths with the forces of what touches at the start and does not bounce, the velocity at their end, who is
     touched by them, the number of contacts that are not resolved, and who has a collider without a distance there."""
-    path = free_path(x, displacement, dv, contacts.dt)
-    at_start = jnp.zeros_like(contacts.both(jnp.add, path.s))
-    gap, slope, normal, recession, _ = contacts.look(path, at_start)
-    small = contacts.roundoff(x)
-    stays = (gap <= small) & (-slope <= impulsive_limit(contacts, normal, path) + slow) & contacts.possible()
-    stays = lax.stop_gradient(stays)
-
+    (gap, _, normal, recession, _), small, stays = at_start(contacts, free_path(x, displacement, dv, contacts.dt), slow)
     end_speed = contacts.relative(v + dv) + recession[:, None] * normal
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
     rest = at_rest(Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays), small)
@@ -81,6 +100,15 @@ def hold(
     path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.kick)
     lost = _touched(contacts, jnp.isnan(gap) & (jnp.arange(contacts.count) < contacts.walls)) & contacts.alive
     return path, v + dv + rest.kick, touched, unresolved, lost
+
+
+def at_start(contacts: Contacts, path: Path, slow: Array) -> tuple[Look, Array, Array]:
+    """What there is to know of the contacts where the step starts, the gaps (contact,) that are none, and who touches
+    and does not bounce."""
+    start = contacts.look(path, jnp.zeros_like(contacts.both(jnp.add, path.s)))
+    small = contacts.roundoff(path.x)
+    slowly = -start.slope <= impulsive_limit(contacts, start.normal, path) + slow
+    return start, small, lax.stop_gradient((start.gap <= small) & slowly & contacts.possible())
 
 
 def _touched(contacts: Contacts, on: Array) -> Array:

@@ -15,6 +15,7 @@ from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.component import replace
 from jeuler._core.components import split, stack
+from jeuler.contact.collisions import Collisions
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import BEFORE, acts, name_of, needs
 from jeuler.particles.protocols import Context
@@ -22,7 +23,7 @@ from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
 from jeuler.solving._scan import advance_by
 from jeuler.solving.grid import Grid
-from jeuler.steps.explicit import Step
+from jeuler.steps.explicit import Step, VectorField
 
 
 class Moment:
@@ -64,8 +65,36 @@ class SceneStep:
 
     @functools.cached_property
     def advance(self) -> Callable[..., Any]:
-        step = self.step if hasattr(self.step, "increment") else on_arrays(self.step)
-        return advance_by(step, compensated=self.compensated)
+        contact = self.contact_in_the_solve()
+        if hasattr(self.step, "increment") and contact is None:
+            return advance_by(self.step, compensated=self.compensated)
+        return advance_by(on_arrays(self.step, contact), compensated=self.compensated)
+
+    def contact_in_the_solve(self) -> Callable[..., VectorField] | None:
+        """What makes contact at rest part of the equation of a step that solves for its end; None where there is none.
+
+        ``in_step(f, t, y, dt, attributes)`` is f with it: v + dt f is the velocity after the forces, contact included.
+        """
+        collisions = [effect for effect in self.scene.effects if isinstance(effect, Collisions)]
+        if not collisions or getattr(self.step, "explicit", False):
+            return None
+
+        def in_step(f, t, y, dt, attributes):
+            x, v = y
+            mass = self.with_prescribed_pinned(t, jnp.broadcast_to(attributes.mass, (len(x),)), x.dtype)
+            state = ParticleState(x, v, mass, alive=attributes.alive)
+            start = f(t, y, attributes)[1]
+            answers = [effect.answer(t, dt, state, start) for effect in collisions]
+
+            def with_contact(t, y, attributes):
+                slope, acceleration = f(t, y, attributes)
+                for answer in answers:
+                    acceleration = acceleration + answer(v + dt * acceleration) / dt
+                return slope, acceleration
+
+            return with_contact
+
+        return in_step
 
     def __call__(self, n: Array, t: Array, carried: tuple[Any, Any]) -> tuple[Any, Any]:
         """What is carried, (state in parts, remainder of its sums), after the step from t, the n-th from 0."""
@@ -108,9 +137,14 @@ class SceneStep:
     ) -> ParticleState:
         """The effect on a state in which prescribed particles have mass inf, whatever mass they have."""
         mass = jnp.broadcast_to(state.mass, (len(state.position),))
-        for indices, *_ in self.equation.prescribed(t, state.position.dtype):
-            mass = mass.at[indices].set(jnp.inf)
+        mass = self.with_prescribed_pinned(t, mass, state.position.dtype)
         return replace(act(t, dt, previous, replace(state, mass=mass)), mass=state.mass)
+
+    def with_prescribed_pinned(self, t: Any, mass: Array, dtype: Any) -> Array:
+        """mass, (particle,), with inf for the prescribed particles."""
+        for indices, *_ in self.equation.prescribed(t, dtype):
+            mass = mass.at[indices].set(jnp.inf)
+        return mass
 
     def field(self, t: Any, motion: tuple[Any, ...], attributes: Any) -> tuple[Any, ...]:
         """The equation of motion by component, as the motion is carried from step to step."""
@@ -128,15 +162,33 @@ def with_its_needs(effect: Any, key: Array | None, n: Any, t0: Array) -> Callabl
     return functools.partial(with_previous(effect, ""), key=key, **clock)
 
 
-def on_arrays(step: Step) -> Step:
-    """A step of somebody's own, which may do arithmetic on (particle, dim) arrays, for the motion by components."""
+@dataclasses.dataclass(frozen=True)
+class FieldInStep:
+    """A vector field on arrays that is another one within a step, see `jeuler.steps.implicit.in_step`."""
+
+    field: VectorField
+    changed: Callable[..., VectorField]
+
+    def __call__(self, t: Any, y: Any, args: Any) -> Any:
+        return self.field(t, y, args)
+
+    def in_step(self, t: Any, y: Any, dt: Any, args: Any) -> VectorField:
+        return self.changed(self.field, t, y, dt, args)
+
+
+def on_arrays(step: Step, changed: Callable[..., VectorField] | None = None) -> Step:
+    """A step that may do arithmetic on (particle, dim) arrays, for the motion by components.
+
+    Within the step the vector field f is ``changed(f, t, y, dt, attributes)``, for steps that ask for it.
+    """
 
     def by_components(f, t, motion, dt, attributes):
         def on_arrays(t, y, attributes):
             return tuple(map(stack, f(t, tuple(map(split, y)), attributes)))
 
         arrays = tuple(map(stack, motion))
-        after = step(on_arrays, t, arrays, dt, attributes)
+        field = on_arrays if changed is None else FieldInStep(on_arrays, changed)
+        after = step(field, t, arrays, dt, attributes)
         checks.same_form("the step", arrays, after)
         return tuple(map(split, after))
 

@@ -107,7 +107,7 @@ class ImplicitEuler:
 
     def with_info(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, StepInfo]:
         """The state at t + dt, and how the iterations went."""
-        system = _system(f, t, y, dt, args)
+        system = _system(in_step(f, t, y, dt, args), t, y, dt, args)
         floor = system.roundoff
         if not floor.size:
             return y, StepInfo(jnp.asarray(True), jnp.int32(0))
@@ -190,6 +190,7 @@ class LinearlyImplicitEuler:
 
     def __call__(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> PyTree:
         y = checks.state("y", y)
+        f = in_step(f, t, y, dt, args)
         slope, push = jax.linearize(lambda y: f(t + dt, y, args), y)
 
         def tangent_field(t, z, args):
@@ -204,6 +205,12 @@ class LinearlyImplicitEuler:
 
 implicit_euler_step: ImplicitEuler = implicit_euler()
 linearly_implicit_euler_step: LinearlyImplicitEuler = linearly_implicit_euler()
+
+
+def in_step(f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> VectorField:
+    """f as it is in the step from (t, y): with ``f.in_step(t, y, dt, args)``, if it has one, for what acts through the
+    step and depends on where it ends, as forces of contact do."""
+    return f.in_step(t, y, dt, args) if hasattr(f, "in_step") else f
 
 
 class System(NamedTuple):

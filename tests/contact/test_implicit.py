@@ -1,0 +1,100 @@
+"""Contact at rest beside steps that solve for their end: it is part of what they solve."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+from jeuler import Collisions, Plane
+
+G = 9.8
+FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
+GRAVITY = jeuler.Gravity([0.0, -G])
+IMPLICIT = jeuler.implicit_euler_step
+
+
+def two_balls(ks, height, step, **contact):
+    """Two balls of 1 kg above each other, joined by a spring of 1 m, whose lower one is at this height."""
+    position = jnp.array([[0.0, 0.1], [0.0, 1.1]]) + jnp.array([0.0, 1.0]) * height
+    floor = Collisions((FLOOR,), radius=0.1, **contact)
+    scene = jeuler.Scene((GRAVITY, jeuler.Springs([[0, 1]], ks, 1.0, 1.0)), (floor,))
+    state = jeuler.ParticleState(position, 0 * position)
+    return jeuler.simulate(scene, state, dt=0.01, num_steps=200, save_every=40, step=step)
+
+
+@pytest.mark.parametrize("step", [IMPLICIT, jeuler.linearly_implicit_euler_step], ids=lambda step: step.__name__)
+def test_a_stiff_spring_on_the_floor_carries_the_weight(step):
+    """At once where it stands there, and after a fall of half a metre."""
+
+    def shortened(ks, height):
+        run = two_balls(ks, height, step, restitution=0.3, friction=0.5)
+        return 1 - (run.y.position[1:, 1, 1] - run.y.position[1:, 0, 1]), run
+
+    ks, height = jnp.array([1e6, 1e8, 1e8]), jnp.array([0.0, 0.0, 0.5])
+    by, run = jax.jit(jax.vmap(shortened))(ks, height)
+    np.testing.assert_allclose(ks[:2, None] * by[:2], G, rtol=1e-6)
+    np.testing.assert_allclose(ks[2] * by[2, -1], G, rtol=1e-6)
+    np.testing.assert_allclose(run.y.position[:, -1, 0], np.broadcast_to([0.0, 0.1], (3, 2)), atol=1e-12)
+    np.testing.assert_array_equal(run.unresolved_contacts, 0)
+
+
+def test_gradient_of_a_spring_at_rest_on_the_floor():
+    def height(ks):
+        return two_balls(ks, 0.0, IMPLICIT).y.position[-1, 1, 1]
+
+    ks = 1e5
+    value, slope = jax.jit(jax.value_and_grad(height))(ks)
+    np.testing.assert_allclose(value, 1.1 - G / ks, rtol=1e-12)
+    np.testing.assert_allclose(slope, G / ks**2, rtol=1e-6)
+
+
+def test_two_balls_with_a_spring_hold_on_a_slope_or_slide_as_one():
+    """Friction at rest is part of the solve too."""
+    angle = np.deg2rad(20.0)
+    normal, along = np.array([-np.sin(angle), np.cos(angle)]), np.array([np.cos(angle), np.sin(angle)])
+    position = 0.1 * normal + np.array([[0.0], [1.0]]) * along
+
+    def speed(friction):
+        contact = Collisions((Plane([0.0, 0.0], normal),), radius=0.1, friction=friction)
+        scene = jeuler.Scene((GRAVITY, jeuler.Springs([[0, 1]], 1e6, 1.0, 1.0)), (contact,))
+        state = jeuler.ParticleState(jnp.asarray(position), jnp.zeros((2, 2)))
+        return jeuler.simulate(scene, state, dt=0.01, num_steps=50, step=IMPLICIT).y.velocity[-1] @ along
+
+    friction = np.array([0.0, 0.2, 0.5])
+    right = -G * 0.5 * np.maximum(np.sin(angle) - friction * np.cos(angle), 0)
+    np.testing.assert_allclose(jax.jit(jax.vmap(speed))(friction), np.stack([right, right], 1), atol=1e-6)
+
+
+def test_stack_of_balls_and_a_spring_beside_an_implicit_step():
+    """Three balls on each other, the upper two joined: contact between balls and the spring share the weight."""
+    position = np.array([[0.0, 0.1], [0.0, 0.3], [0.0, 0.8]])
+    contact = Collisions((FLOOR,), pairs=[(0, 1), (1, 2)], radius=0.1)
+    scene = jeuler.Scene((GRAVITY, jeuler.Springs([[1, 2]], 1e7, 1.0, 0.5)), (contact,))
+    state = jeuler.ParticleState(jnp.asarray(position), jnp.zeros((3, 2)))
+    run = jeuler.simulate(scene, state, dt=0.01, num_steps=100, save_every=50, step=IMPLICIT)
+    shortened = 0.5 - (run.y.position[1:, 2, 1] - run.y.position[1:, 1, 1])
+    np.testing.assert_allclose(1e7 * shortened, G, rtol=1e-6)
+    np.testing.assert_allclose(run.y.position[1:, :2], np.stack([position[:2]] * 2), atol=1e-12)
+    assert int(run.unresolved_contacts) == 0
+
+
+def test_net_of_many_balls_stands_on_the_floor():
+    """More unknowns than are solved for with a matrix: the floor carries the whole net, each vertical layer its part."""
+    wide, high = 8, 9
+    position = np.array([[0.5 * x, 0.1 + 0.5 * y] for y in range(high) for x in range(wide)])
+    node = np.arange(wide * high).reshape(high, wide)
+    neighbours = [(node[:, :-1], node[:, 1:]), (node[:-1], node[1:]), (node[:-1, :-1], node[1:, 1:])]
+    edges = np.concatenate([np.stack([a.ravel(), b.ravel()], 1) for a, b in neighbours])
+    rest = np.linalg.norm(position[edges[:, 1]] - position[edges[:, 0]], axis=1)
+    scene = jeuler.Scene(
+        (GRAVITY, jeuler.Springs(edges, 1e6, 10.0, rest)), (Collisions((FLOOR,), radius=0.1, friction=0.5),)
+    )
+    state = jeuler.ParticleState(jnp.asarray(position), jnp.zeros_like(position))
+    run = jeuler.simulate(scene, state, dt=0.01, num_steps=100, save_every=100, step=IMPLICIT)
+    end = np.asarray(run.y.position[-1])
+    d = end[edges[:, 1]] - end[edges[:, 0]]
+    push = (1e6 * (rest / np.linalg.norm(d, axis=1) - 1))[:, None] * d
+    between = (edges[:, 0] < wide) & (edges[:, 1] >= wide)
+    np.testing.assert_allclose(push[between].sum(0), [0.0, G * wide * (high - 1)], atol=1e-4)
+    np.testing.assert_allclose(end[:wide, 1], 0.1, atol=1e-12)
