@@ -17,7 +17,9 @@ from jeuler._core.vectors import direction
 from jeuler.particles.fields import START
 from jeuler.particles.state import DEFAULTS
 
-NOT_DRAWN = ("position", "velocity", "mass", "alive", "age", "lifetime", "births", "missed_births", "extra")
+NOT_DRAWN = (
+    "position", "velocity", "mass", "alive", "age", "lifetime", "births", "missed_births", "steps", "frames", "extra",
+)  # fmt: skip
 
 
 @component(static=("field",))
@@ -53,6 +55,7 @@ class OverLife:
     duration: OptionalParameter = default(None)
 
     acts = START
+    needs: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.field, str):

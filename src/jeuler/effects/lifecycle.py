@@ -27,7 +27,9 @@ _OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
 class Emitter:
     """Births: a steady stream and bursts, into the first free slots of the pool.
 
-        births in step n of the run = floor((n + 1) rate dt) - floor(n rate dt) + the bursts nearest to its start
+        births in step n = floor((n + 1) rate dt) - floor(n rate dt) + the bursts nearest to its start
+
+    n counts from the first step of the run, or of the run that this one goes on from (``state.steps``).
 
     A newborn is placed where it would be had it been born at a random moment of the step, so that a fast jet shows no
     layers. A birth that finds no free slot, or goes beyond ``max_births``, is counted in ``state.missed_births``; all
@@ -126,12 +128,17 @@ class Emitter:
         further = {name: one(sampler) for name, sampler in (self.extra or {}).items()}
         return {**dict.fromkeys(("alive", *COUNTERS, *self.samplers), ()), **further}
 
-    def number_of_births(self, t: Any, dt: Any, clock: tuple[Any, Any] | None = None) -> Array:
-        """Births in the step that starts at t; ``clock`` is the number of that step in its run, and the run's start."""
+    def number_of_births(
+        self, t: Any, dt: Any, clock: tuple[Any, Any] | None = None, steps: Array | None = None
+    ) -> Array:
+        """Births in the step that starts at t; ``clock`` is the number of that step in its run, and the run's start.
+
+        ``steps``: its number with the run that this one goes on from.
+        """
         n, t0 = (step_number(t, dt), 0.0) if clock is None else clock
         per_step = lax.stop_gradient(self.rate * dt)
         streaming = (t + dt / 2 >= self.start) & (t + dt / 2 < self.stop)
-        stream = jnp.where(streaming, births_of_stream(n.astype(jnp.int32), per_step), 0)
+        stream = jnp.where(streaming, births_of_stream((n if steps is None else steps).astype(jnp.int32), per_step), 0)
         burst = sum(jnp.where(step_number(time - t0, dt) == n, number, 0) for time, number in self.bursts)
         return (stream + burst).astype(jnp.int32)
 
@@ -140,7 +147,7 @@ class Emitter:
         capacity = len(state.position)
         block = min(self.max_births or capacity, capacity)
         slot, free = first_free(state.alive, block)
-        wanted = self.number_of_births(t, dt, clock)
+        wanted = self.number_of_births(t, dt, clock, state.steps)
         births = jnp.minimum(wanted, jnp.minimum(free, block))
         slot = jnp.where(jnp.arange(block) < births, slot, capacity)
 
@@ -224,7 +231,7 @@ def first_free(alive: Array, count: int) -> tuple[Array, Array]:
     return 32 * word + bit, up_to[-1]
 
 
-@component()
+@component(static=("frames",))
 class Lifetime:
     """Ageing, and death by age.
 
@@ -232,43 +239,57 @@ class Lifetime:
 
     Args:
       duration: the same lifetime for all, (), s, > 0; None takes ``state.lifetime``, which an `Emitter` draws.
+      frames: in place of the duration, the number of steps that each lives, an integer >= 1, whatever dt is: they are
+        counted in ``state.frames``. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state with deaths and ages.
-    Raises: ValueError, if the duration is not above 0.
+    Raises: ValueError, if the duration is not above 0, frames is no integer above 0, or both are given.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> scene = jeuler.Scene(effects=(jeuler.Lifetime(0.2),))
       >>> state = jeuler.ParticleState(jnp.ones((1, 2)), jnp.zeros((1, 2)))
       >>> jeuler.simulate(scene, state, dt=0.1, num_steps=3).y.alive[:, 0].tolist()
       [True, True, True, False]
+      >>> scene = jeuler.Scene(effects=(jeuler.Lifetime(frames=1),))
+      >>> jeuler.simulate(scene, state, dt=0.1, num_steps=3).y.alive[:, 0].tolist()
+      [True, True, False, False]
 
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.4.
     """
 
     duration: OptionalParameter = default(None)
+    frames: int | None = None
 
     acts = BEFORE
     needs: ClassVar[tuple[str, ...]] = ("forward time",)
-    sets: ClassVar[tuple[str, ...]] = ("age",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 
     def __post_init__(self) -> None:
+        if self.duration is not None and self.frames is not None:
+            raise ValueError("Lifetime must have a duration in s or a number of frames, got both; leave one out")
         if self.duration is not None:
             checks.positive("Lifetime.duration", self.duration, "s")
+        if self.frames is not None:
+            object.__setattr__(self, "frames", checks.count("Lifetime.frames", self.frames, least=1))
         store_as_float(self, "duration")
 
     @property
     def reads(self) -> tuple[str, ...]:
-        return () if self.duration is not None else ("lifetime",)
+        return ("lifetime",) if self.duration is None and self.frames is None else ()
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        return ("age",) if self.frames is None else ("age", "frames")
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
+        age = state.age + dt.astype(state.age.dtype)
+        if self.frames is not None:
+            return state.replace(alive=state.alive & (state.frames < self.frames), age=age, frames=state.frames + 1)
         limit = state.lifetime if self.duration is None else self.duration
         # ages are sums of dt: a lifetime of three steps ends after three, not four; 1,000 sums in float32 are 3 % off
         steps = jnp.minimum(limit / dt, 1e9)
         small = dt * jnp.minimum(1e-3 + jnp.finfo(state.age.dtype).eps * steps**2 / 4, 0.45)
-        return state.replace(
-            alive=state.alive & (state.age < limit - small), age=state.age + dt.astype(state.age.dtype)
-        )
+        return state.replace(alive=state.alive & (state.age < limit - small), age=age)
 
 
 @component(static=("condition",))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -83,6 +83,8 @@ class PrescribedMotion:
 
     particles: ParticleIndices
     path: MovingParameter
+
+    needs: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         given = list(self.particles) if isinstance(self.particles, range) else self.particles

@@ -16,10 +16,10 @@ from jeuler._core.components import per_particle
 from jeuler._core.limits import check_parameters
 from jeuler._jax import programs
 from jeuler.particles.equation import Equation
-from jeuler.particles.fields import START, acts, name_of, needs, with_required_fields
+from jeuler.particles.fields import START, acts, draws, name_of, needs, with_required_fields
 from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
-from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
+from jeuler.particles.state import ParticleState, join_state, split_state, with_default_fields, zero_dead_slots
 from jeuler.particles.step import SceneStep, with_its_needs
 from jeuler.particles.windows import in_windows
 from jeuler.solving._scan import INSTEAD, Solution, check_save, check_step, no_remainder, reversible_loop
@@ -64,7 +64,8 @@ def simulate(
       step: the method, as in `solve`.
       save_every: save each save_every-th step; must divide num_steps.
       save: ``save(t, state)`` makes what is kept of a saved state; None keeps the state.
-      key: a ``jax.random.key`` for effects that draw random numbers; each gets its own at each step.
+      key: a ``jax.random.key`` for effects that draw random numbers; each gets its own at each step. A run from a state
+        that another saved, with the same key and scene and its time as t0, goes on as that one would have.
       checkpoint: memory of reverse mode, as in `solve`; "reversible" for scenes of forces alone.
       compensated: compensated sums of position and velocity, as in `solve`.
       windows: sizes in increasing order, or "auto" for a ladder of them. Between two saved states the run works on
@@ -192,6 +193,8 @@ def first_step(
     """The step and the first state of a run; checked in what does not depend on values."""
     check_step(step)
     state = with_required_fields(state, scene.forces, scene.effects)
+    if any(draws(effect, key) or needs(effect, "clock") for effect in scene.effects):
+        state = with_default_fields(state, ("steps",))
     state = _at_start(scene, state, grid, key)
     motion = checks.state("state", (state.position, state.velocity))
     form = checks.form_of("the sum of forces", scene.vector_field, grid.t0, motion, scene.attributes(state))
@@ -264,5 +267,11 @@ def _at_start(scene: Scene, state: ParticleState, grid: Grid, key: Array | None)
         if acts(effect) == START:
             own_key = None if key is None else jax.random.fold_in(jax.random.fold_in(key, 2**32 - 1), k)
             act = with_its_needs(effect, own_key, jnp.int32(0), grid.t0)
-            state = act(grid.t0, jnp.zeros_like(grid.dt), state, state)
+            acted = act(grid.t0, jnp.zeros_like(grid.dt), state, state)
+            state = acted if not draws(effect, key) else _if_new(acted, state)
     return state if state.alive is None else zero_dead_slots(state)
+
+
+def _if_new(acted: ParticleState, state: ParticleState) -> ParticleState:
+    """What a random effect did at the start, unless the state is of a run that has begun: it was done there."""
+    return jax.tree.map(lambda a, b: jnp.where(jnp.asarray(state.steps) == 0, a, b), acted, state)

@@ -84,6 +84,11 @@ def needs(effect: Any, what: Need) -> bool:
     return what in declared(effect, "needs") or (what == "key" and declared(effect, "random", False))
 
 
+def draws(effect: Any, key: Any) -> bool:
+    """Whether an effect may draw random numbers; one that does not say what it needs does so if there is a key."""
+    return needs(effect, "key") or (key is not None and declared(effect, "needs", None) is None)
+
+
 def name_of(part: Any) -> str:
     part = unwrapped(part)
     return getattr(part, "__name__", type(part).__name__)

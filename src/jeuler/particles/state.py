@@ -25,6 +25,7 @@ DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
     "opacity": ((), 1.0),
     "size": ((), 1.0),
     "shape": ((), 0),
+    "frames": ((), 0),
 }
 COUNTERS = ("births", "missed_births")  # one number for the whole pool, int32
 
@@ -50,6 +51,9 @@ class ParticleState:
       births: () int32, the number of particles born since the start.
       missed_births: () int32, the births that found no free slot.
       unresolved_contacts: () int32, impacts and overlaps that `Collisions` did not resolve.
+      steps: () int32, the steps taken since the start, where random numbers or births hang on it: a run from a saved
+        state goes on with those of the run that it was saved from.
+      frames: (particle,) int32, the steps that a particle has lived, where `Lifetime` counts them.
       extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
     Raises: ValueError, if a field is not an array of numbers; `simulate` checks the shapes.
     Example:
@@ -74,6 +78,8 @@ class ParticleState:
     births: OptionalParameter = default(None)
     missed_births: OptionalParameter = default(None)
     unresolved_contacts: OptionalParameter = default(None)
+    steps: OptionalParameter = default(None)
+    frames: OptionalParameter = default(None)
     extra: dict[str, Array] | None = None
 
     def __post_init__(self) -> None:
@@ -224,7 +230,7 @@ def with_default_fields(
         if name == "mass":
             values[name] = jnp.broadcast_to(state.mass, (particles,))
         elif name not in state.fields():
-            if name in (*COUNTERS, "unresolved_contacts"):
+            if name in (*COUNTERS, "unresolved_contacts", "steps"):
                 values[name] = jnp.int32(0)
             else:
                 shape, value = DEFAULTS.get(name, ((shapes or {}).get(name, ()), 0.0))

@@ -104,8 +104,9 @@ class SceneStep:
     def parts(self, n: Array, t: Array, carried: tuple[Any, Any]) -> Iterator[tuple[str, Moment, Any]]:
         """The name of each part of the step, and the moment after it, in their order."""
         parts, remainder = carried
+        number = n if parts[1].steps is None else parts[1].steps
         before = moment = Moment(parts=parts)
-        for name, effect in self.effects(n, early=True):
+        for name, effect in self.effects(n, number, early=True):
             moment = Moment(state=effect(t, self.grid.dt, before.state, moment.state))
             yield name, moment, remainder
 
@@ -113,20 +114,24 @@ class SceneStep:
         motion, remainder = self.advance(
             self.field, t, (motion, remainder), self.grid.dt, self.scene.attributes(moment.state)
         )
+        rest = rest if rest.steps is None else replace(rest, steps=number + 1)
         moment = Moment(parts=(motion, rest))
         yield name_of(self.step), moment, remainder
 
-        for name, effect in self.effects(n, early=False):
+        for name, effect in self.effects(n, number, early=False):
             moment = Moment(state=effect(self.grid.clock(n + 1), self.grid.dt, before.state, moment.state))
             yield name, moment, remainder
         if self.scene.effects and rest.alive is not None:
             yield "dead slots", Moment(state=zero_dead_slots(moment.state)), remainder
 
-    def effects(self, n: Array, *, early: bool) -> Iterator[tuple[str, Callable[..., Any]]]:
-        """Name, and ``effect(t, dt, previous, state)`` with the key of step n, of those before the motion, or after."""
+    def effects(self, n: Array, number: Array, *, early: bool) -> Iterator[tuple[str, Callable[..., Any]]]:
+        """Name, and ``effect(t, dt, previous, state)`` with its key, of those before the motion, or after.
+
+        n is the number of the step in this run, ``number`` with those of the run that this one goes on from.
+        """
         for k, effect in enumerate(self.scene.effects):
             if (acts(effect) == BEFORE) == early:
-                key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, n), k)
+                key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, number), k)
                 act = with_its_needs(effect, key, n, self.grid.t0)
                 if needs(effect, "prescribed pinned") and self.equation.effects:
                     act = functools.partial(self._with_prescribed_pinned, act)

@@ -83,7 +83,8 @@ def solve_adaptive(
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
       y0: initial state, any pytree of floating or complex arrays. Differentiable.
-      t1: the final time, or increasing times (time,) to stop at, all > t0, s.
+      t1: the final time, or increasing times (time,) to stop at, s, none before t0; t0 itself gives y0. Where t1 is
+        traced and earlier, every state is NaN.
       t0: initial time, s.
       args: passed to f. Differentiable.
       step: an `extrapolated_euler` step of order 2 or more; None takes the method of Tsitouras of order 5, with the
@@ -116,8 +117,11 @@ def solve_adaptive(
             raise ValueError(f"{name} must be at least 0, got {tolerance!r}")
     times = jnp.atleast_1d(jnp.asarray(t1, trees.time_dtype(y0)))
     t0 = jnp.asarray(t0, times.dtype)
-    if not checks.is_traced(times) and not checks.is_traced(t0) and not np.all(np.diff(times, prepend=t0) > 0):
-        raise ValueError(f"t1 must be later than t0={float(t0)} and increase, got {times.tolist()}")
+    if not checks.is_traced(times) and not checks.is_traced(t0) and not _in_order(t0, times):
+        raise ValueError(
+            f"t1 must not be before t0={float(t0)}, and must increase, got {np.asarray(times).tolist()}; backwards in "
+            f"time goes solve with a negative dt"
+        )
     if dt0 is not None:
         checks.positive("dt0", dt0, "s")
     f, args = arrays_only(f, args)
@@ -141,6 +145,7 @@ def _solve_adaptive(
     """`solve_adaptive`, as it is compiled."""
     f, step = field.function, stepper.function
     checks.vector_field(f, t0, y0, args)
+    times = jnp.where(_in_order(t0, times), times, jnp.nan)
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
 
@@ -191,6 +196,11 @@ def _solve_adaptive(
     (_, _, _, error, accepted, rejected), (y, reached) = lax.scan(to_time, start, (jnp.append(t0, stops[:-1]), stops))
     y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[asked]]), y0, y)
     return AdaptiveSolution(jnp.append(t0, times), y, accepted, rejected, error, reached[-1])
+
+
+def _in_order(t0: Array, times: Array) -> Array:
+    """Whether the times increase from t0 on; the first may be t0."""
+    return (times[0] >= t0) & jnp.all(jnp.diff(times) > 0)
 
 
 def error_ratio(error: PyTree, y: PyTree, y_next: PyTree, rtol: Any, atol: Any) -> Array:
