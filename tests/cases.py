@@ -139,7 +139,7 @@ def path(t):
 
 
 SAMPLES = np.array([[[0.0, 0.0]], [[0.1, 0.2]], [[0.3, 0.1]], [[0.2, 0.0]]])
-POOL = ("alive", "births", "missed_births")
+POOL = ("alive", "births", "missed_births", "steps")
 PLACE, SPEED = [0.5, 2.0], [0.1, 0.3]
 LIFE = jeuler.Lifetime(0.5)
 SOLIDS = (FLOOR, jeuler.Sphere([2.0, 2.0], 0.2), jeuler.Box([-2.0, 1.0], 0.3))

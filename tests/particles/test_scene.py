@@ -1,6 +1,7 @@
 """Scenes and runs: every force and effect against the contract, diffrax and conservation laws."""
 
 import dataclasses
+import warnings
 
 import diffrax
 import jax
@@ -21,6 +22,7 @@ from cases import (
 )
 
 import jeuler
+from jeuler import ParticleState, Scene
 from jeuler.particles.fields import with_required_fields
 
 RUN = {"dt": 0.01, "num_steps": 50}
@@ -372,3 +374,31 @@ def test_bad_edges(edges, message):
 def test_scene_wants_tuples():
     with pytest.raises(ValueError, match="Scene.forces must be a tuple, got Springs"):
         jeuler.Scene(forces=SPRING)
+
+
+FALLING = ParticleState(jnp.ones((1, 2)), jnp.zeros((1, 2)))
+FORCES = (jeuler.Gravity([0.0, -9.8]),)
+BOUNCING = Scene(FORCES, (jeuler.Collisions((jeuler.Plane([0.0, 0.0], [0.0, 1.0]),)), jeuler.SpeedLimit(5.0)))
+
+
+def test_a_vector_field_without_the_effects_of_its_scene_says_so():
+    with pytest.warns(UserWarning, match="without Collisions, SpeedLimit: run the scene by jeuler.simulate") as warned:
+        jeuler.solve(BOUNCING.vector_field, (FALLING.position, FALLING.velocity), args=1.0, dt=0.1, num_steps=1)
+    assert [w.filename for w in warned] == [__file__], "one warning, at the line that took the field"
+    with pytest.warns(UserWarning, match=r"write scene.without_effects\(\).vector_field"):
+        diffrax.ODETerm(BOUNCING.vector_field)
+
+
+def test_a_vector_field_that_is_all_of_its_scene_is_silent():
+    hand = jeuler.PrescribedMotion([0], lambda t: jnp.zeros((1, 2)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        motion = FALLING.position, FALLING.velocity
+        assert BOUNCING.without_effects().vector_field(0.0, motion, 1.0)[1].tolist() == [[0.0, -9.8]]
+        for scene in (Scene(FORCES), Scene(FORCES, (hand,))):
+            assert scene.without_effects() is scene
+            jeuler.solve(scene.vector_field, motion, args=1.0, dt=0.1, num_steps=1)
+        assert Scene(FORCES, (hand, *BOUNCING.effects)).without_effects().effects == (hand,)
+        jeuler.simulate(BOUNCING, FALLING, dt=0.1, num_steps=1)
+        jeuler.stability_limit(BOUNCING, FALLING)
+        jeuler.advise_step(BOUNCING, FALLING, t1=0.1, error=0.1)

@@ -329,7 +329,7 @@ def _as_array(expected: Any, came: Any) -> str:
 def field_form(f: Any) -> None:
     """f is a function that can be called as a vector field, ``f(t, y, args) -> dy/dt``."""
     hint = "args is there even if f does not need it"
-    if hasattr(f, "vector_field"):
+    if hasattr(type(f), "vector_field"):
         hint = "pass scene.vector_field, or run the scene by jeuler.simulate"
     refuse_class("f must be a function (t, y, args) -> dy/dt", f)
     function("f", f, "(t, y, args) -> dy/dt", hint)

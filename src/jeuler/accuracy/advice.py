@@ -16,8 +16,7 @@ from jeuler._core.precision import flat
 from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
 from jeuler.accuracy.search import AIM, FACTOR, Search
-from jeuler.particles.fields import name_of
-from jeuler.particles.scene import Scene
+from jeuler.particles.scene import Scene, effects_left_out
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -112,9 +111,9 @@ def advise_step(
     """
     left_out = ""
     if isinstance(f, Scene):
-        effects = [name_of(effect) for effect in f.effects if not hasattr(effect, "constrain")]
+        effects = effects_left_out(f)
         left_out = f"; without {', '.join(effects)}, which pilot runs leave out" if effects else ""
-        (y0, args), f = f.as_equation(y0), f.vector_field
+        (y0, args), f = f.as_equation(y0), f.without_effects().vector_field
     y0 = checks.state("y0", y0)
     checks.untraced("advise_step", y0, args, t0, t1, error)
     t0, t1 = checks.interval(t0, t1)

@@ -28,8 +28,7 @@ from jeuler.accuracy.method import has_diffrax
 from jeuler.accuracy.pilot import distance
 from jeuler.accuracy.trials import Found, Target, Trial, cheapest, milliseconds
 from jeuler.accuracy.written import code_of
-from jeuler.particles.fields import name_of
-from jeuler.particles.scene import Scene
+from jeuler.particles.scene import Scene, effects_left_out
 from jeuler.solving._breaks import checked_breaks
 from jeuler.steps.explicit import VectorField
 
@@ -247,10 +246,10 @@ class _Given:
     def of(cls, f: Any, y0: Any, args: Any) -> _Given:
         if not isinstance(f, Scene):
             return cls(f, y0, args, False, "")
-        effects = [name_of(effect) for effect in f.effects if not hasattr(effect, "constrain")]
+        effects = effects_left_out(f)
         left_out = f"; without {', '.join(effects)}, which pilot runs leave out" if effects else ""
         y0, args = f.as_equation(y0)
-        return cls(f.vector_field, y0, args, True, left_out)
+        return cls(f.without_effects().vector_field, y0, args, True, left_out)
 
 
 class _Ranking:

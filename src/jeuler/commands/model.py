@@ -129,7 +129,7 @@ class Model:
             return v[:, :n] + offset
         import jax
 
-        acceleration = jax.vmap(lambda t, p, v: scene.vector_field(t, (p, v), mass)[1])(t, p, v)
+        acceleration = jax.vmap(lambda t, p, v: scene.without_effects().vector_field(t, (p, v), mass)[1])(t, p, v)
         return acceleration[:, :n] + offset
 
     def predict(self, params: dict[str, Any], times: np.ndarray, dt: float, t0: float, num_steps: int) -> Array:
@@ -139,7 +139,7 @@ class Model:
         fraction, width = jnp.asarray(s)[:, None, None], jnp.asarray(dt)
         import jax
 
-        a = jax.vmap(lambda p, v, t: scene.vector_field(t, (p, v), mass)[1])
+        a = jax.vmap(lambda p, v, t: scene.without_effects().vector_field(t, (p, v), mass)[1])
         at = t0 + dt * jnp.arange(num_steps + 1)
         position = hermite(fraction, width, p[interval], p[interval + 1], v[interval], v[interval + 1])
         if self.observe in ("position", "angle"):

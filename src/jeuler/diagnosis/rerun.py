@@ -91,7 +91,9 @@ class Rerun:
         motion = self.state.position, self.state.velocity
         try:
             attributes = self.scene.attributes(self.state)
-            return stability_limit(self.scene.vector_field, self.of_one.grid.t0, motion, attributes, step=self.step)
+            return stability_limit(
+                self.scene.without_effects().vector_field, self.of_one.grid.t0, motion, attributes, step=self.step
+            )
         except ValueError:
             return np.inf
 

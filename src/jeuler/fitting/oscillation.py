@@ -81,7 +81,7 @@ def modes(scene: Scene, state: ParticleState) -> list[Mode]:
     def slope(moving: Any) -> Any:
         position, velocity = moving
         y = state.position.at[free].set(position), state.velocity.at[free].set(velocity)
-        v, a = scene.vector_field(0.0, y, state.mass)
+        v, a = scene.without_effects().vector_field(0.0, y, state.mass)
         return v[free], a[free]
 
     at = state.position[free], state.velocity[free] * 0

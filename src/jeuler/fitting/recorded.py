@@ -75,6 +75,11 @@ class Recorded:
                 raise ValueError(f"{name} must be a value, got a traced one; only positions and parameters are traced")
         times, targets = checked_observations(times, positions, state.position.shape, float(t0))
         _refuse_stillness(targets)
+        if dt > times[-1] - t0 and times[-1] > t0:
+            raise ValueError(
+                f"dt must be at most the span of the times, {times[-1] - t0:g} s from t0={t0:g} s, got {dt:g} s; "
+                f"dt is the step of the simulation, take one well below the period of the motion"
+            )
         needed = max(1, int(np.ceil((times[-1] - t0) / dt * (1 - 1e-12))))
         num_steps = needed if num_steps is None else checks.count("num_steps", num_steps, least=1)
         if num_steps < needed:

@@ -197,7 +197,9 @@ def first_step(
         state = with_default_fields(state, ("steps",))
     state = _at_start(scene, state, grid, key)
     motion = checks.state("state", (state.position, state.velocity))
-    form = checks.form_of("the sum of forces", scene.vector_field, grid.t0, motion, scene.attributes(state))
+    form = checks.form_of(
+        "the sum of forces", scene.without_effects().vector_field, grid.t0, motion, scene.attributes(state)
+    )
     checks.same_form("the sum of forces", motion, form)
     _check_effects(scene, state, grid, key)
     return SceneStep.of(scene, state, grid, step, key, **how), state

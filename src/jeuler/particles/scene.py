@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,11 +11,31 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.calls import with_previous
-from jeuler._core.component import as_component, component
+from jeuler._core.component import as_component, component, replace
 from jeuler.particles.equation import Attributes, Equation
 from jeuler.particles.fields import declared, name_of, with_required_fields
 from jeuler.particles.protocols import Context
 from jeuler.particles.state import ParticleState
+
+
+class _Announced:
+    """The method `vector_field`, which warns where it is taken from a scene that has more than its forces."""
+
+    def __init__(self, method: Callable[..., Any]) -> None:
+        self.method = method
+        self.__doc__ = method.__doc__
+
+    def __get__(self, scene: Scene | None, owner: Any = None) -> Callable[..., Any]:
+        if scene is None:
+            return self.method
+        names = effects_left_out(scene)
+        if names:
+            warnings.warn(
+                f"scene.vector_field holds the forces and prescribed motion, without {', '.join(names)}: run the scene "
+                f"by jeuler.simulate, or write scene.without_effects().vector_field where that is what you want",
+                stacklevel=2,
+            )
+        return self.method.__get__(scene, owner)
 
 
 @component()
@@ -54,10 +76,13 @@ class Scene:
                 _check_part(name, part)
             object.__setattr__(self, name, tuple(as_component(part) for part in parts))
 
+    @_Announced
     def vector_field(self, t: Any, y: tuple[Array, Array], args: Any) -> tuple[Array, Array]:
         """The equation of motion, as `solve` and ``diffrax.ODETerm`` take it.
 
             (position, velocity) -> (velocity, acceleration)
+
+        Effects other than prescribed motion are no part of it: a scene that has some warns, see `without_effects`.
 
         Args:
           t: time, s.
@@ -75,6 +100,20 @@ class Scene:
         """
         context = Context(len(y[0]), y[0].dtype)
         return Equation.of(self.forces, self.effects, context).vector_field(t, y, args)
+
+    def without_effects(self) -> Scene:
+        """The scene of its forces and prescribed motion alone: all of what `vector_field` holds.
+
+        Returns: `Scene`, this one if it has no other effects.
+        Example:
+          >>> import jeuler
+          >>> scene = jeuler.Scene(forces=(jeuler.Gravity([-9.8]),), effects=(jeuler.SpeedLimit(3.0),))
+          >>> scene.without_effects().effects
+          ()
+        """
+        if not effects_left_out(self):
+            return self
+        return replace(self, effects=tuple(effect for effect in self.effects if hasattr(effect, "prescribe")))
 
     def attributes(self, state: ParticleState) -> Attributes:
         """What `vector_field` takes as args: the mass, and with it only those fields that some force reads.
@@ -113,6 +152,11 @@ class Scene:
         for part in (*self.forces, *self.effects):
             if hasattr(part, "check"):
                 part.check(*state.position.shape)
+
+
+def effects_left_out(scene: Scene) -> tuple[str, ...]:
+    """The names of the effects that `vector_field` does not hold."""
+    return tuple(name_of(effect) for effect in scene.effects if not hasattr(effect, "prescribe"))
 
 
 def _check_part(name: str, part: Any) -> None:

@@ -123,7 +123,7 @@ def stability_limit(
     if hasattr(scene, "as_equation"):
         t, state = (0.0 if y is None else y, t) if hasattr(t, "position") else (t, y)
         y, args = scene.as_equation(state)
-        f = scene.vector_field
+        f = scene.without_effects().vector_field
     elif y is None:
         raise ValueError("y must be the state at time t, got None; call stability_limit(f, t, y, args)")
     checks.untraced("stability_limit", t, y, args)
