@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from cases import FORCES, force_state, leapfrog_step
+from jax.test_util import check_grads
 
 import jeuler
 from jeuler.particles.equation import Equation
@@ -306,3 +307,18 @@ def test_a_light_particle_in_single_precision_gets_to_the_speed_of_the_air():
     for kind in TERMINAL.values():
         end = jeuler.simulate(jeuler.Scene((kind(1.0, air=WIND),)), state, dt=0.1, num_steps=30).y
         np.testing.assert_allclose(end.velocity[-1, 0], WIND, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["quadratic", "three"])
+def test_derivatives_through_the_limit_are_those_of_the_step(name):
+    """By differences, forward and reverse, of all that a limited step reads; for some particles the limit binds."""
+    _, state = falling(DRAGS[name](1.0))
+
+    def end(coefficient, velocity, mass, push, dt):
+        scene = jeuler.Scene((jeuler.Gravity(push), *DRAGS[name](coefficient)))
+        start = state.replace(velocity=velocity, mass=mass)
+        return jeuler.simulate(scene, start, dt=dt, num_steps=2, step=jeuler.symplectic_euler_step).y.velocity[-1]
+
+    velocity = jnp.asarray(VELOCITY) + 0.1
+    arguments = jnp.float64(0.7), velocity, jnp.asarray([30.0, 0.01, 9.0, 2.0]), jnp.asarray(PUSH), jnp.float64(0.4)
+    check_grads(jax.jit(end), arguments, order=1, modes=("fwd", "rev"), atol=1e-7, rtol=1e-7, eps=1e-6)

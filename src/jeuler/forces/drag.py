@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,6 +15,7 @@ from jeuler._core.component import component, store_as_float
 from jeuler._core.components import split, stack
 from jeuler._core.limits import Limits, check_limits
 from jeuler._core.vectors import dot, total
+from jeuler._jax.materialise import kept, stored
 from jeuler.forces.air import air_velocity, as_air, check_air
 
 
@@ -32,16 +34,36 @@ class Resistance(NamedTuple):
 
     def force(self, v: Sequence[Array]) -> list[Array]:
         """The force on each particle, one array (particle,) a component, N."""
-        u = self.relative(v)
-        parts = [] if self.linear is None else [[-self.linear * one for one in u]]
-        if self.quadratic is not None:
-            speed = length(u)
-            parts.append([-self.quadratic * speed * one for one in u])
-        return [total(terms) for terms in zip(*parts, strict=True)]
+        return self.through(v).force()
 
-    def relative(self, v: Sequence[Array]) -> Sequence[Array]:
-        """u, the velocity through the air."""
-        return v if self.air is None else [a - b for a, b in zip(v, self.air, strict=True)]
+    def through(self, v: Sequence[Array]) -> Flow:
+        """The same drag on particles of velocity v."""
+        v = [kept(one) for one in v]
+        u = v if self.air is None else [a - b for a, b in zip(v, self.air, strict=True)]
+        return Flow(*self, u, None if self.quadratic is None else stored(length(u)))
+
+
+class Flow(NamedTuple):
+    """A drag on particles that move.
+
+    Attributes:
+      linear, quadratic, air: as in `Resistance`.
+      u: v - w, one array (particle,) a component, m/s.
+      speed: |u|, (particle,), m/s; None where there is no quadratic drag.
+    """
+
+    linear: Any
+    quadratic: Any
+    air: Any
+    u: Sequence[Array]
+    speed: Array | None
+
+    def force(self) -> list[Array]:
+        """The force on each particle, one array (particle,) a component, N."""
+        parts = [] if self.linear is None else [[-self.linear * one for one in self.u]]
+        if self.speed is not None:
+            parts.append([-self.quadratic * self.speed * one for one in self.u])
+        return [total(terms) for terms in zip(*parts, strict=True)]
 
 
 def length(u: Sequence[Array]) -> Array:
@@ -54,22 +76,17 @@ def root(x: Array) -> Array:
     return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1)), 0)
 
 
-def inertia(mass: Array, dt: Array, drags: Sequence[Resistance], v: Sequence[Array], others: Sequence[Array]) -> Array:
-    """max(m, dt kappa): the mass with which an explicit first-order step of dt does not overshoot, kg.
+def acceleration(
+    force: Sequence[Array], mass: Array, dt: Array, drags: Sequence[Flow], others: Sequence[Array]
+) -> list[Array]:
+    """F / max(m, dt kappa) by component, with which an explicit first-order step of dt does not overshoot, m/s^2.
 
         v' = v + dt F / max(m, dt kappa)
 
-    F is the sum of all forces, and kappa (`stiffness`) bounds how fast the drags among them change with the velocity.
-    Let v* be the velocity at which they balance the other forces, which are held for the step. F is the slope of a
-    convex function, so F.(v* - v) <= kappa |v* - v|^2: the step does not go beyond v*, and F = 0 there alone. Where
+    F is the sum of all forces, and kappa bounds how fast the drags among them change with the velocity: by no more than
+    kappa |v - v*| between v and v*, where they balance the other forces, which are held for the step. F is the slope of
+    a convex function, so F.(v* - v) <= kappa |v* - v|^2: the step does not go beyond v*, and F = 0 there alone. Where
     dt kappa <= m this is m to the last bit.
-    """
-    least = dt.astype(mass.dtype) * stiffness(drags, v, others)
-    return jnp.where((least > mass) & jnp.isfinite(least), least, mass)
-
-
-def stiffness(drags: Sequence[Resistance], v: Sequence[Array], others: Sequence[Array]) -> Array:
-    """kappa, kg/s: drag changes by no more than kappa |v - v*| between v and v*, where it balances the other forces.
 
         linear drags alone               kappa = c = sum c_i
         quadratic ones in one wind w     kappa = c/2 + q |v - w| + sqrt(c^2 + 4 q G) / 2,   q = sum q_j
@@ -82,21 +99,85 @@ def stiffness(drags: Sequence[Resistance], v: Sequence[Array], others: Sequence[
     |u| u is Lipschitz with |u| + |u*|, and |v* - w_j| <= R + |w_j - w|, where q R^2 + (c - 2 B) R = G bounds |v* - w|:
     (|a| a - |b| b).(a - b) >= r^3 - 2 |b| r^2 for r = |a - b|.
     """
-    c = total(d.linear for d in drags if d.linear is not None) if any(d.linear is not None for d in drags) else 0
-    quadratic = [d for d in drags if d.quadratic is not None]
+    dt = jnp.broadcast_to(dt, ()).astype(mass.dtype)
+    linear = [d.linear for d in drags if d.linear is not None]
+    c = total(linear) if linear else jnp.zeros_like(mass)
+    quadratic = [d for d in drags if d.speed is not None]
     if not quadratic:
-        return jnp.asarray(c)
+        return quotient(force, longer(dt * c, mass))
     q, w, winds = _mean_wind(quadratic)
-    slope = total(d.quadratic * length(d.relative(v)) for d in quadratic)
-    spread = total(d.quadratic * length(wind) for d, wind in zip(quadratic, winds, strict=True)) if winds else 0
-    at_w = [zero + share for zero, share in zip(_drag_at(w, drags, v), others, strict=True)]
-    both = q * length(at_w)
-    if isinstance(c, int) and not winds:
-        return slope + root(both)
-    return c / 2 + slope + 2 * spread + root((c - 2 * spread) ** 2 + 4 * both) / 2
+    slope = total(d.quadratic * d.speed for d in quadratic)
+    at_w = [zero + share for zero, share in zip(_drag_at(w, drags), others, strict=True)]
+    if linear or winds:
+        spread = total(d.quadratic * length(wind) for d, wind in zip(quadratic, winds, strict=True)) if winds else 0
+        slope, c = c / 2 + slope + 2 * spread, c / 2 - spread
+    return limited(force, mass, dt, slope, c, q, at_w)
 
 
-def _mean_wind(quadratic: Sequence[Resistance]) -> tuple[Array, Sequence[Array] | None, list[Any]]:
+def longer(least: Array, mass: Array) -> Array:
+    """The mass, or ``least`` where that is more."""
+    return jnp.where((least > mass) & jnp.isfinite(least), least, mass)
+
+
+@jax.custom_jvp
+def quotient(force: Sequence[Array], mass: Array) -> list[Array]:
+    """F / m by component."""
+    return [one / mass for one in force]
+
+
+@quotient.defjvp
+def _quotient_jvp(primals, tangents):
+    (force, mass), (dforce, dmass) = primals, tangents
+    i = 1 / mass
+    by_mass = i * jnp.broadcast_to(dmass, force[0].shape) if force else dmass  # summed once, not for each component
+    return quotient(force, mass), [i * (df - i * one * by_mass) for one, df in zip(force, dforce, strict=True)]
+
+
+@jax.custom_jvp
+def limited(
+    force: Sequence[Array], mass: Array, dt: Array, slope: Array, b: Array, q: Array, at_w: Sequence[Array]
+) -> list[Array]:
+    """F / max(m, dt (slope + sqrt(b^2 + q |F_w|))) by component; the root is 0 at 0, with its derivative."""
+    m = longer(dt * (slope + root(b * b + q * length(at_w))), mass)
+    return [one / m for one in force]
+
+
+@limited.defjvp
+def _limited_jvp(primals, tangents):
+    """Written so that XLA makes few kernels of it, and few that wait for another: by 1 / max(m, ...), and by one over
+    each root, not by the roots."""
+    force, mass, dt, slope, b, q, at_w = primals
+    dforce, dmass, ddt, dslope, db, dq, dat_w = tangents
+    i = stored(1 / longer(dt * (slope + root(b * b + q * length(at_w))), mass))
+    binds = i < 1 / mass
+    by_size, size = inverse_root(dot(at_w, at_w))
+    by_root, s = inverse_root(b * b + q * size)
+    by_force = stored(by_root * by_size * q / 2)
+    ds = by_force * dot(at_w, dat_w) + by_root * (b * db + size * dq / 2)
+    dm = jnp.where(binds, dt * (dslope + ds) + (slope + s) * ddt, dmass)
+    changes = [i * (df - i * one * dm) for one, df in zip(force, dforce, strict=True)]
+    return limited(*primals), changes
+
+
+def inverse_root(x: Array) -> tuple[Array, Array]:
+    """1 / sqrt(x) and sqrt(x), x >= 0; 0 and 0 at 0."""
+    normal = x >= jnp.finfo(x.dtype).tiny
+    i = jnp.where(normal, jnp.sqrt(1 / jnp.where(normal, x, 1)), 0)
+    return i, x * i
+
+
+@jax.custom_jvp
+def once(x: Array) -> Array:
+    """x, worked out once and stored; its cotangent is not."""
+    return stored(x)
+
+
+@once.defjvp
+def _once_jvp(primals, tangents):
+    return once(*primals), tangents[0]
+
+
+def _mean_wind(quadratic: Sequence[Flow]) -> tuple[Array, Sequence[Array] | None, list[Any]]:
     """q, the mean wind w of quadratic drags (None: 0), and w_j - w of each; none of these where there is one wind."""
     q = total(d.quadratic for d in quadratic)
     blowing = [d for d in quadratic if d.air is not None]
@@ -111,13 +192,14 @@ def _mean_wind(quadratic: Sequence[Resistance]) -> tuple[Array, Sequence[Array] 
     )
 
 
-def _drag_at(w: Sequence[Array] | None, drags: Sequence[Resistance], v: Sequence[Array]) -> Sequence[Any]:
+def _drag_at(w: Sequence[Array] | None, drags: Sequence[Flow]) -> Sequence[Any]:
     """The drags at the velocity w, by component; 0 where none acts there."""
-    drags = [d for d in drags if d.air is not w]
-    if not drags:
-        return [0] * len(v)
-    at = [jnp.zeros_like(one) for one in v] if w is None else w
-    return [total(terms) for terms in zip(*(d.force(at) for d in drags), strict=True)]
+    like = drags[0].u
+    there = [Resistance(d.linear, d.quadratic, d.air) for d in drags if d.air is not w]
+    if not there:
+        return [0] * len(like)
+    at = [jnp.zeros_like(one) for one in like] if w is None else w
+    return [total(terms) for terms in zip(*(d.force(at) for d in there), strict=True)]
 
 
 class _Drag:

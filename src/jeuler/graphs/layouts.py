@@ -121,7 +121,7 @@ class Shifts(Layout):
         squares, approaches = (self.dot_differences(y, x) for y in (x, v))
         values = map(law, squares, approaches, *map(self.by_group, parameters))
         c = [stored(jnp.where(edges < 0, 0, value)) for edges, value in zip(self.slot_edges, values, strict=True)]
-        return [laplacian(c, component, self.offsets) for component in x]
+        return [laplacian(c, kept(component), self.offsets) for component in x]
 
     def dot_differences(self, x: Sequence[Array], y: Sequence[Array]) -> list[Array]:
         """(B x).(B y), one array a group."""

@@ -13,8 +13,8 @@ from jeuler._core import checks
 from jeuler._core.component import component
 from jeuler._core.components import by_component, split, stack
 from jeuler._core.vectors import total
-from jeuler._jax.materialise import stored
-from jeuler.forces.drag import Resistance, inertia
+from jeuler.forces.drag import Flow, once
+from jeuler.forces.drag import acceleration as limited_acceleration
 from jeuler.particles.fields import declared, name_of
 from jeuler.particles.protocols import Context
 from jeuler.steps.explicit import is_explicit_of_first_order
@@ -56,7 +56,7 @@ class Share(NamedTuple):
 
     name: str
     force: Sequence[Array]
-    drag: Resistance | None
+    drag: Flow | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,9 +85,9 @@ class Equation:
     def vector_field(self, t: Any, y: tuple[Array, Array], args: Any) -> tuple[Array, Array]:
         """The slope (velocity, acceleration) of (position, velocity), m/s and m/s^2."""
         attributes, x, v = self.moving(t, y, args)
-        force, mass = self.net_force(t, x, v, attributes)
-        alive = attributes.alive
-        acceleration = [f / mass if alive is None else jnp.where(alive, f / mass, 0) for f in force]
+        acceleration = self.acceleration(t, x, v, attributes)
+        if attributes.alive is not None:
+            acceleration = [jnp.where(attributes.alive, one, 0) for one in acceleration]
         slope = stack(v), stack(acceleration)
         for indices, _, velocity, rate in self.prescribed(t, slope[0].dtype):
             slope = slope[0].at[indices].set(velocity), slope[1].at[indices].set(rate)
@@ -125,27 +125,26 @@ class Equation:
                 if kernel is None:
                     continue
             if limited and hasattr(kernel, "drag"):
-                drag = kernel.drag(t, stack(x))
-                yield Share(name, drag.force(v), drag)
+                drag = kernel.drag(t, stack(x)).through(v)
+                yield Share(name, drag.force(), drag)
             else:
                 fields = {field: attributes.field(field, name) for field in reads}
                 position = stack(x)
                 force = checked_force(name, kernel(t, position, stack(v), mass, **fields), position.shape)
                 yield Share(name, split(force), None)
 
-    def net_force(self, t: Any, x: Any, v: Any, attributes: Attributes) -> tuple[list[Array], Array]:
-        """The sum of forces by component, and the mass that it acts on, kg."""
+    def acceleration(self, t: Any, x: Any, v: Any, attributes: Attributes) -> list[Array]:
+        """The sum of forces over the mass, or over that with which no drag overshoots, by component."""
         shares = list(self.shares(t, x, v, attributes))
         drags = [share.drag for share in shares if share.drag is not None]
-        if not drags:
-            return add([share.force for share in shares], x), attributes.mass
         others = add([share.force for share in shares if share.drag is None], x)
-        quadratic = any(drag.quadratic is not None for drag in drags)
-        if quadratic:  # each component needs the forces on all: without this, XLA works these out again for each
-            others = [stored(component) for component in others]
-        mass = inertia(attributes.mass, jnp.asarray(self.context.dt), drags, v, others)
-        mass = stored(mass) if quadratic else mass
-        return add([others, *(share.force for share in shares if share.drag is not None)], x), mass
+        if not drags:
+            return [force / attributes.mass for force in others]
+        if any(drag.speed is not None for drag in drags):
+            # each component needs the forces on all: without this, XLA works these out again for each
+            others = [once(component) for component in others]
+        force = add([others, *(share.force for share in shares if share.drag is not None)], x)
+        return limited_acceleration(force, attributes.mass, jnp.asarray(self.context.dt), drags, others)
 
 
 def checked_force(name: str, force: Any, shape: tuple[int, ...]) -> Array:
