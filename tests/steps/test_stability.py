@@ -45,6 +45,27 @@ def test_oscillator_has_the_closed_form_limit(step, damping_ratio, expected):
     assert limit == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.filterwarnings("ignore:stability_limit")
+@pytest.mark.parametrize("damping_ratio", [1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 3e-15, 1e-16, 0.0])
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.heun_step, extrapolated_euler(2), jeuler.rk4_step])
+def test_weak_damping_has_its_limit_however_slow_the_growth_above_it(step, damping_ratio):
+    """Of Euler 2 zeta; of order two (8 zeta)^(1/3); of RK4 that on the imaginary axis."""
+    exact = {1: 2 * damping_ratio, 2: (8 * damping_ratio) ** (1 / 3), 4: math.sqrt(8)}[step.order] / 5
+    limit = stability_limit(oscillator, 0.0, START, (KS, 10 * damping_ratio), step=step)
+    assert limit.lower <= 1.01 * exact
+    assert 0.99 * exact <= limit.upper
+    if damping_ratio >= 1e-13 or step.order == 4:
+        assert limit == pytest.approx(exact, rel=0.01)
+    slow = {1: 2e-5, 2: 1e-9, 4: -1}[step.order]
+    if damping_ratio > 10 * slow:
+        assert limit.known
+        assert limit.reason == "all eigenvalues"
+    if damping_ratio < slow / 10:
+        assert limit.upper == pytest.approx({1: math.sqrt(2e-12), 2: 8e-12**0.25}[step.order] / 5, rel=0.1)
+        assert "it is less than 1e-12 a step" in limit.reason or "cannot be told from roundoff" in limit.reason
+        assert limit.known is (damping_ratio < 1e-14 and step.order == 1)  # growth of Euler shows at once
+
+
 @pytest.mark.parametrize(
     ("step", "interval"),
     [

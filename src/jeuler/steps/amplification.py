@@ -14,7 +14,8 @@ import numpy as np
 from jeuler._core.precision import double_precision
 from jeuler.steps.explicit import Step
 
-ROUNDOFF = 1e-15  # |R| - 1 below this is 0
+ROUNDOFF = 1e3 * float(np.finfo(float).eps)  # of |R| - 1, in units of |Re z| + |z|^2
+SLOWEST = 1e-12  # growth a step that long runs can tell from roundoff
 
 
 def amplification(step: Step, z: jax.Array) -> jax.Array:
@@ -24,9 +25,24 @@ def amplification(step: Step, z: jax.Array) -> jax.Array:
     return jnp.hypot(image[0], image[1])
 
 
+def growth(step: Step, z: jax.Array) -> jax.Array:
+    """|R(z)| - 1, also where it is far below roundoff of |R|, if the step says its increment."""
+    matrix, start = jnp.array([[z.real, -z.imag], [z.imag, z.real]]), jnp.array([1.0, 0.0])
+
+    def linear(t, u, a):
+        return a @ u
+
+    if hasattr(step, "increment"):
+        change = step.increment(linear, 0.0, start, 1.0, matrix)
+    else:
+        change = step(linear, 0.0, start, 1.0, matrix) - start
+    square = 2 * change[0] + change[0] ** 2 + change[1] ** 2  # |R|^2 - 1
+    return square / (1 + jnp.sqrt(jnp.maximum(1 + square, 0)))
+
+
 @functools.partial(jax.jit, static_argnames="step")
-def _scalar_gain(step, unit, s):
-    return jax.vmap(jax.vmap(lambda z: amplification(step, z)))(unit[:, None] * s)
+def _growth(step, unit, s):
+    return jax.vmap(jax.vmap(lambda z: growth(step, z)))(unit[:, None] * s)
 
 
 def _unit_pairs():
@@ -58,38 +74,62 @@ def _treats_all_alike(step: Any) -> bool:
 def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> np.ndarray:
     """The largest stable dt of each eigenvalue, Re <= 0."""
     size = np.abs(rates)
-    return largest_stable(functools.partial(_scalar_gain, step, rates / size), 1 / (size * interval)) / size
+    unit = rates / size
+    roundoff = functools.partial(_roundoff, step, unit)
+    return largest_stable(functools.partial(_growth, step, unit), roundoff, 1 / (size * interval)) / size
 
 
-def largest_stable(gain: Callable[[np.ndarray], jax.Array], growth: np.ndarray) -> np.ndarray:
+def growth_at(step: Step, rates: np.ndarray, dt: float) -> float:
+    """The largest |R| - 1 of these modes."""
+    size = np.abs(rates)
+    return float(np.max(_growth(step, rates / size, (dt * size)[:, None])))
+
+
+def growth_shows(step: Step, rates: np.ndarray) -> float:
+    """The least dt at which one of these modes grows by `SLOWEST` a step, at least; inf if none does."""
+    size = np.abs(rates)
+    s = np.logspace(-8, 4, 1201)
+    shows = np.asarray(_growth(step, rates / size, np.broadcast_to(s, (len(rates), 1201)))) >= SLOWEST
+    first = np.where(shows.any(axis=1), s[shows.argmax(axis=1)], np.inf)
+    return float(np.min(first / size))
+
+
+def _roundoff(step: Step, unit: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Below it |R| - 1 says nothing."""
+    if not hasattr(step, "increment"):
+        return np.full(s.shape, 1e-15)
+    return ROUNDOFF * (np.abs(unit.real)[:, None] * s + s**2)
+
+
+def largest_stable(gain: Callable[..., Any], roundoff: Callable[..., Any], allowed: np.ndarray) -> np.ndarray:
     """For each mode the end of the first stable interval of s = dt |lambda|: 0.0 if it is empty, inf if endless.
 
-    gain: |R| at s, both of shape (mode, point). growth: rate allowed to each mode, in units of |lambda|,
-      (mode,).
+    gain, roundoff: |R| - 1 at s, and what is none, all of shape (mode, point). allowed: growth allowed to each mode, in
+      units of |lambda|, (mode,).
     """
-    points, lasting = 801, 25  # 50 a decade; above 1 over half a decade is no noise of a solve
-    modes = len(growth)
-    s = np.broadcast_to(np.logspace(-8, 8, points), (modes, points))
+    points, lasting = 1051, 25  # 50 a decade; above 1 over half a decade is no noise of a solve
+    modes = len(allowed)
+    s = np.broadcast_to(np.logspace(-13, 8, points), (modes, points))
 
     def excess(s):
-        above = np.asarray(gain(s)) - 1 - growth[:, None] * s
+        above = np.asarray(gain(s)) - allowed[:, None] * s
         return np.where(np.isfinite(above), above, np.inf)
 
-    above = excess(s)
-    unstable = above > ROUNDOFF
+    above, none = excess(s), roundoff(s)
+    unstable = above > none
     lasts = np.stack([unstable[:, k : points - lasting + k] for k in range(lasting)]).all(axis=0)
     first, ends = np.argmax(lasts, axis=1), np.any(lasts, axis=1)
     limits = np.where(ends, 0.0, np.inf)
     for mode in np.flatnonzero(ends & (first > 0)):
         # growth as s^2 or s^4 is below roundoff at small s: an interval without decay counts only if long
-        decay = above[mode, : first[mode]].min()
-        if decay < -4 * ROUNDOFF or s[mode, first[mode]] > 0.05:
+        decays = above[mode, : first[mode]] < -4 * none[mode, : first[mode]]
+        if decays.any() or s[mode, first[mode]] > 0.05:
             limits[mode] = s[mode, first[mode]]
     found = (limits > 0) & np.isfinite(limits)
     low, high = (np.where(found, s[range(modes), np.maximum(first - k, 0)], 1.0) for k in (1, 0))
-    for _ in range(3 if found.any() else 0):  # three times a grid of 801 points between the last two
+    for _ in range(2 if found.any() else 0):  # twice a grid of as many points between the last two
         s = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, points)
-        unstable = excess(s) > ROUNDOFF
+        unstable = excess(s) > roundoff(s)
         first = np.maximum(unstable.argmax(1), 1)
         low, high = s[range(modes), first - 1], s[range(modes), first]
     return np.where(found, low, limits)

@@ -76,15 +76,22 @@ def reduced_pair(product: Callable[..., Any], n: int, weights: np.ndarray) -> Re
     for _ in range(8):
         direction = slope(direction, still)[1]
         size = np.linalg.norm(direction)
-        rate = np.sqrt(size)
         if not size > 0:
             break
+        rate = np.sqrt(size)
         direction = direction / size
-    basis = arnoldi(lambda u: slope(u, rate * u)[1], start, MOST)
-    columns = []
-    for x, v in [(column, still) for column in basis.T] + [(still, column) for column in basis.T]:
-        dx, dv = slope(x, v)
-        columns.append(np.concatenate([basis.T @ dx, basis.T @ dv]))
+    both = []  # slopes of (u, rate u)
+
+    def image(u):
+        both.append(slope(u, rate * u))
+        return both[-1][1]
+
+    basis = arnoldi(image, start, MOST)
+    of_position = [slope(column, still) for column in basis.T]
+    of_velocity = [
+        tuple((a - b) / rate for a, b in zip(*pair, strict=True)) for pair in zip(both, of_position, strict=True)
+    ]
+    columns = [np.concatenate([basis.T @ dx, basis.T @ dv]) for dx, dv in (*of_position, *of_velocity)]
     k = basis.shape[1]
     like = jnp.zeros(k), jnp.zeros(k)
     lift = lambda z: np.concatenate([basis @ z[:k] / weights, basis @ z[k:] / weights])  # noqa: E731

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import warnings
 from collections.abc import Callable
@@ -14,20 +15,26 @@ import numpy as np
 
 from jeuler._core import checks, trees
 from jeuler._core.arguments import says_what_to_write
+from jeuler._core.component import Function
 from jeuler._core.describe import table
 from jeuler._core.partition import arrays_only
 from jeuler._core.precision import cast, double_precision
-from jeuler.steps.amplification import scalar_limits, treats_all_alike
+from jeuler._jax import programs
+from jeuler.steps.amplification import SLOWEST, growth_at, growth_shows, scalar_limits, treats_all_alike
 from jeuler.steps.explicit import Step, VectorField, euler_step
 from jeuler.steps.reduced import SEGMENTS, Reduced, Runs, reduced_pair, reduced_whole, symmetric_weights
-from jeuler.steps.step_map import StepMap, matrix_of_step
+from jeuler.steps.step_map import GROWTH, StepMap, matrix_of_step
 
 PyTree = Any
 
 DENSE = 512  # numbers in the state up to which all eigenvalues of the Jacobian are computed
 DENSE_MAP = 192  # and those of the step's own matrix, at every dt tried
 NEUTRAL = 4.0  # |eigenvalue| below this times sqrt(eps) of the largest is a zero mode: so far a double zero splits
-UNDAMPED = 1e-10  # |real part| below this part of the largest eigenvalue is zero up to roundoff
+UNDAMPED = (
+    1e-10  # |real part| below this part of the largest eigenvalue is zero up to roundoff, if its own is not known
+)
+WEAK = 1e-7  # a real part below this part of the largest eigenvalue is compared with its own roundoff
+AT_ONCE = 1e-4  # dt |lambda|: growth that shows from there on shows at every dt
 NEAR = 0.015  # a limit is confirmed by runs at dt so much below and above it
 SECONDS = 4.0  # for the runs that check a large system
 
@@ -37,9 +44,9 @@ class StabilityLimit(float):
 
     Attributes:
       lower: dt known to be stable, s.
-      upper: dt known to be unstable, s; inf if none is.
-      known: whether lower and upper are within 2 % of the limit.
-      reason: how it was found, or what is not known about it.
+      upper: dt from which on growth shows, by 1e-12 a step or more, s; inf if none does.
+      known: whether lower and upper are within 2 % of the limit; of 0.0, whether growth shows at once.
+      reason: how it was found, what is not known about it, and where growth is too slow to show.
     Example:
       >>> import jeuler
       >>> limit = jeuler.stability_limit(lambda t, y, args: -4.0 * y, 0.0, 1.0)
@@ -87,10 +94,14 @@ def stability_limit(
     without damping. `symplectic_euler_step` on an undamped oscillator: 2 / omega. Implicit Euler: no limit, inf.
 
     The limit belongs to the state: look at it where the system is stiffest. Eigenvalues lambda that are 0 up to the
-    roundoff of the data (a system that can drift) do not count. Up to 512 numbers in the state (192 for steps such as
-    `symplectic_euler_step`) all eigenvalues are computed. Above, the step is applied in a Krylov space of J, and runs
-    of the step in full size confirm that a perturbation decays 1.5 % below the limit found and grows 1.5 % above it, or
-    correct it by bisection. Where they do not, `StabilityLimit.known` is False, ``reason`` says what is known, and a
+    roundoff of the data (a system that can drift) do not count, and a real part that is 0 up to the roundoff of its own
+    eigenvalue is 0. Growth is told from roundoff by the step's increment, however slow: then `StabilityLimit.upper` is
+    where it reaches 1e-12 a step, which runs can show.
+
+    Up to 512 numbers in the state (192 for steps such as `symplectic_euler_step`) all eigenvalues are computed. Above,
+    the step is applied in a Krylov space of J, and runs of the step in full size confirm that a perturbation decays
+    1.5 % below the limit found and grows 1.5 % above it, or correct it by bisection. Where the limit is not known
+    within 2 %, or growth above it does not show, `StabilityLimit.known` is False, ``reason`` says what is known, and a
     warning is given. Computed in float64 on the host, so it is not for use under jit.
 
     Args:
@@ -151,15 +162,52 @@ class Spectrum:
     matrix: np.ndarray
     like: Any  # a state of the form on which the step works with this J
 
+    errors: np.ndarray  # of the real parts of those that count
+
     @classmethod
-    def of(cls, matrix: np.ndarray, like: Any, neutral: float) -> Spectrum:
+    def of(cls, matrix: np.ndarray, like: Any, neutral: float, exact: bool = False) -> Spectrum:
+        """exact: know weak damping from roundoff where that can be told."""
         rates = np.linalg.eigvals(matrix).astype(complex)
         scale = np.abs(rates).max(initial=0.0)
+        errors = np.full(rates.shape, UNDAMPED * scale)
+        if exact and np.any(np.abs(rates.real) <= WEAK * scale):
+            rates, errors = eigenvalues(matrix)
+            scale = np.abs(rates).max(initial=0.0)
         moving = np.abs(rates) > neutral * scale
-        grows = moving & (rates.real > UNDAMPED * scale)
-        counting = rates[moving & ~grows]
-        counting = np.where(np.abs(counting.real) <= UNDAMPED * scale, 1j * counting.imag, counting)
-        return cls(scale, counting, rates[grows], int(np.sum(~moving)), matrix, like)
+        grows = moving & (rates.real > np.maximum(UNDAMPED * scale, errors))
+        counts = moving & ~grows
+        counting = rates[counts]
+        counting = np.where(counting.real >= -errors[counts], 1j * counting.imag, counting)
+        return cls(scale, counting, rates[grows], int(np.sum(~moving)), matrix, like, errors[counts])
+
+
+def eigenvalues(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The eigenvalues, and what roundoff makes of each: eps |A| over the cosine of its left and right vectors.
+
+    Source: G. H. Golub, C. F. Van Loan, Matrix Computations, 1996, sect. 7.2.2.
+    """
+    import scipy.linalg
+
+    balanced, _ = scipy.linalg.matrix_balance(matrix, permute=False)
+    rates, left, right = scipy.linalg.eig(balanced, left=True)
+    cosine = np.abs(np.sum(left.conj() * right, axis=0))
+    with np.errstate(divide="ignore"):
+        return rates, 8 * np.finfo(float).eps * np.linalg.norm(balanced) / cosine
+
+
+def flat_field(f: VectorField, y: PyTree, args: PyTree, t: Any, flat: Any) -> Any:
+    """f on the numbers of a state of the form of y."""
+    slope = f(t, trees.real_vector(y)[1](flat), args)
+    return trees.real_vector(trees.in_dtypes_of(y, slope))[0]
+
+
+def _product(field: Function, y: PyTree, args: PyTree, t: Any, flat: Any, u: Any) -> Any:
+    return jax.jvp(functools.partial(flat_field, field.function, y, args, t), (flat,), (u,))[1]
+
+
+def _matrix(field: Function, y: PyTree, args: PyTree, t: Any, flat: Any) -> Any:
+    product = functools.partial(_product, field, y, args, t, flat)
+    return jax.vmap(product, in_axes=1, out_axes=1)(jnp.eye(flat.size))
 
 
 class Linearisation:
@@ -170,27 +218,30 @@ class Linearisation:
     args: PyTree
     flat: Any
     unflatten: Callable[[Any], PyTree]
-    images: dict[Any, Callable[..., Any]]
-    field: Callable[[Any, Any], Any]
-    product: Callable[..., Any]
-    products: Callable[..., Any]
 
     def __init__(self, f: VectorField, y: PyTree, args: PyTree) -> None:
+        self.f = f
         self.neutral = NEUTRAL * float(np.sqrt(np.finfo(trees.time_dtype(y)).eps))  # the data's own roundoff
         self.y, self.args = cast(y, np.float64), cast(args, np.float64)
         self.flat, self.unflatten = trees.real_vector(self.y)
-        self.images: dict[Any, Callable[..., Any]] = {}
+        self.last: tuple[Any, Any] = None, None
 
-        def real_field(t, flat):
-            slope = f(t, self.unflatten(flat), self.args)
-            return trees.real_vector(trees.in_dtypes_of(self.y, slope))[0]
+    def field(self, t: Any, flat: Any) -> Any:
+        """f on the numbers of the state."""
+        return flat_field(self.f, self.y, self.args, t, flat)
 
-        def product(t, flat, u):
-            return jax.jvp(lambda flat: real_field(t, flat), (flat,), (u,))[1]
+    def product(self, t: Any, flat: Any, u: Any) -> np.ndarray:
+        """J u."""
+        inputs = Function(self.f), self.y, self.args, jnp.asarray(t, jnp.float64), flat, jnp.asarray(u)
+        return np.asarray(programs.call(_product, inputs))
 
-        self.field = real_field
-        self.product = jax.jit(product)
-        self.products = jax.jit(jax.vmap(product, in_axes=(None, None, 1), out_axes=1))
+    def matrix(self, t: Any, flat: Any) -> np.ndarray:
+        """J, of the state asked for last without work."""
+        key = float(t), np.asarray(flat).tobytes()
+        if self.last[0] != key:
+            inputs = Function(self.f), self.y, self.args, jnp.asarray(t, jnp.float64), flat
+            self.last = key, np.asarray(programs.call(_matrix, inputs))
+        return self.last[1]
 
     def limits(self, t: Any, flat: Any, step: Step, *, interval: float) -> tuple[float, float]:
         """The largest stable dt at a state, and the largest at which no stable mode grows e-fold within an interval.
@@ -203,25 +254,55 @@ class Linearisation:
 
     def limit(self, t: Any, flat: Any, step: Step, *, growing: str) -> StabilityLimit:
         """The largest stable dt at a state, for large systems checked by runs."""
-        spectrum, small = self.spectrum(t, flat, step)
+        spectrum, small = self.spectrum(t, flat, step, exact=True)
         limit = self.limit_of(spectrum, step, growing)
         if small is None:
-            exact = max(limit, 0.0)
-            return StabilityLimit(limit, exact, exact if limit < math.inf else math.inf, True, "all eigenvalues")
+            return self.of_all(spectrum, step, limit, growing)
         return self.checked(t, flat, step, spectrum, small, limit, growing)
 
-    def spectrum(self, t: Any, flat: Any, step: Step) -> tuple[Spectrum, Reduced | None]:
+    def of_all(self, spectrum: Spectrum, step: Step, limit: float, growing: str) -> StabilityLimit:
+        """The limit that all eigenvalues say, and how well."""
+        if growing == "unstable" and spectrum.growing.size:
+            rate = spectrum.growing.real.max()
+            return StabilityLimit(0.0, 0.0, 0.0, True, f"the equation itself grows, by exp({rate:.3g} t)")
+        if not treats_all_alike(step):
+            reason = f"all eigenvalues of the step's matrix, growth below {GROWTH:g} a step taken for roundoff"
+            return StabilityLimit(limit, limit, limit, True, reason)
+        below = f"below dt={{:.3g}} it is less than {SLOWEST:g} a step"
+        if limit == 0.0:
+            shows = growth_shows(step, spectrum.counting)
+            reason = f"no dt is stable: what swings undamped, up to roundoff, grows at every dt; {below.format(shows)}"
+            return StabilityLimit(0.0, 0.0, shows, bool(shows * spectrum.scale < AT_ONCE), reason)
+        rates, errors = spectrum.counting, spectrum.errors
+        sure = dataclasses.replace(spectrum, counting=np.minimum(rates.real + errors, 0) + 1j * rates.imag)
+        perhaps = dataclasses.replace(spectrum, counting=rates.real - errors + 1j * rates.imag)
+        low, high = limit, limit
+        if np.any(errors > 1e-3 * np.abs(rates.real)):
+            low, high = (self.limit_of(part, step, growing) for part in (sure, perhaps))
+            low, high = min(low, limit), max(high, limit)
+        too_slow = math.isfinite(high) and growth_at(step, rates, 1.02 * high) < SLOWEST
+        shows = growth_shows(step, rates) if too_slow else high
+        if high > low * (1 + 2.5 * NEAR):
+            reason = (
+                f"not known within 2 %: dt={low:.3g} to {high:.3g}, as damping that is {errors.max():.1e} 1/s or less "
+                f"cannot be told from roundoff"
+            )
+            return StabilityLimit(limit, low, shows, False, reason)
+        if too_slow:
+            reason = f"all eigenvalues; growth above it is too slow to show in runs: {below.format(shows)}"
+            return StabilityLimit(limit, low, shows, False, reason)
+        return StabilityLimit(limit, low, high, True, "all eigenvalues")
+
+    def spectrum(self, t: Any, flat: Any, step: Step, exact: bool = False) -> tuple[Spectrum, Reduced | None]:
         n = self.flat.size
-        if not np.all(np.isfinite(self.product(t, flat, jnp.ones(n)))):
+        small = n <= (DENSE if treats_all_alike(step) else DENSE_MAP)
+        if not np.all(np.isfinite(self.matrix(t, flat) if small else self.product(t, flat, jnp.ones(n)))):
             raise ValueError(
                 "the Jacobian of f at (t, y) must be finite, got inf or NaN in it; give a state at which f is smooth"
             )
-        if n <= (DENSE if treats_all_alike(step) else DENSE_MAP):
-            matrix = np.asarray(self.products(t, flat, jnp.eye(n)))
-            if np.all(np.isfinite(matrix)):
-                return Spectrum.of(matrix, self.y, self.neutral), None
-            raise ValueError("the Jacobian of f at (t, y) must be finite, got inf or NaN in it")
-        product = lambda u: np.asarray(self.product(t, flat, jnp.asarray(u)))  # noqa: E731
+        if small:
+            return Spectrum.of(self.matrix(t, flat), self.y, self.neutral, exact), None
+        product = functools.partial(self.product, t, flat)
         if self.halves():
             masses = getattr(self.args, "mass", self.args)  # of a scene
             masses = masses if isinstance(masses, jax.Array) else None
@@ -253,10 +334,7 @@ class Linearisation:
         return self.step_map(spectrum, step).limit(interval)
 
     def step_map(self, spectrum: Spectrum, step: Step) -> StepMap:
-        form = step, jax.tree.structure(spectrum.like), len(spectrum.matrix)
-        if form not in self.images:
-            self.images[form] = matrix_of_step(step, spectrum.like)
-        image = self.images[form]
+        image = matrix_of_step(step, spectrum.like)
         return StepMap(lambda dt: image(spectrum.matrix, dt), spectrum.scale, spectrum.neutral, spectrum.growing)
 
     def checked(

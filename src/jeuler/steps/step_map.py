@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -24,6 +25,14 @@ def matrix_of_step(step: Step, like: Any) -> Callable[[np.ndarray, float], np.nd
 
     like: a state of the form on which the step is to work.
     """
+    leaves, structure = jax.tree.flatten(like)
+    hashable: Any = step
+    return _matrix_of_step(hashable, structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
+
+
+@functools.lru_cache(maxsize=64)
+def _matrix_of_step(step: Any, structure: Any, forms: tuple) -> Callable[[np.ndarray, float], np.ndarray]:
+    like = jax.tree.unflatten(structure, [jnp.zeros(shape, dtype) for shape, dtype in forms])
     unflatten = trees.real_vector(like)[1]
 
     def linear(t, y, matrix):
@@ -79,21 +88,25 @@ class StepMap:
         def unstable(dt):
             return self.radius(dt) > GROWTH + dt / interval
 
-        ratio = 10 ** (1 / 16 if len(self.image(1 / self.scale)) <= SMALL else 1 / 8)
+        small = len(self.image(1 / self.scale)) <= SMALL
+
+        def next_to(dt):  # few tries where each is dear: limits are mostly at dt |lambda| from 0.1 to 3
+            return dt * 10 ** (1 / 16 if small else 1 / 8 if 0.05 < dt * self.scale < 8 else 1 / 2)
+
         dt = 1e-3 / self.scale
         if unstable(dt):
-            while unstable(dt):
-                dt /= ratio
-                if dt * self.scale < 1e-8:
+            low, high = dt, dt
+            while unstable(low):
+                low, high = low / 10 ** (1 / 16 if small else 1 / 8), low
+                if low * self.scale < 1e-8:
                     return 0.0
-            low, high = dt, dt * ratio
         else:
             while not (unstable(dt) and unstable(1.02 * dt)):  # twice: no noise of a solve
-                dt *= ratio
+                low, dt = dt, next_to(dt)
                 if dt * self.scale > 1e3:
                     return math.inf
-            low, high = dt / ratio, dt
-        fine = 1e-6 if len(self.image(high)) <= SMALL else 1e-4
+            high = dt
+        fine = 1e-6 if small else 1e-3
         while high > low * (1 + fine):
             middle = math.sqrt(low * high)
             low, high = (low, middle) if unstable(middle) else (middle, high)
