@@ -25,7 +25,7 @@ START = jnp.array(1.0), jnp.array(0.0)
 KS = 25.0  # omega = 5 rad/s
 
 
-@pytest.mark.filterwarnings("ignore:stability_limit: no dt is stable")
+@pytest.mark.filterwarnings("ignore:stability_limit")
 @pytest.mark.parametrize(
     ("step", "damping_ratio", "expected"),
     [

@@ -73,20 +73,29 @@ def _treats_all_alike(step: Any) -> bool:
 
 def scalar_limits(step: Step, rates: np.ndarray, interval: float = math.inf) -> np.ndarray:
     """The largest stable dt of each eigenvalue, Re <= 0."""
+    count, rates = len(rates), filled(rates)
     size = np.abs(rates)
     unit = rates / size
     roundoff = functools.partial(_roundoff, step, unit)
-    return largest_stable(functools.partial(_growth, step, unit), roundoff, 1 / (size * interval)) / size
+    limits = largest_stable(functools.partial(_growth, step, unit), roundoff, 1 / (size * interval)) / size
+    return limits[:count]
+
+
+def filled(rates: np.ndarray) -> np.ndarray:
+    """The same again up to 4, 16, 64, ... of them, so that few programs serve systems of all sizes."""
+    return np.resize(rates, next(4**k for k in range(1, 16) if 4**k >= len(rates)))
 
 
 def growth_at(step: Step, rates: np.ndarray, dt: float) -> float:
     """The largest |R| - 1 of these modes."""
+    rates = filled(rates)
     size = np.abs(rates)
     return float(np.max(_growth(step, rates / size, (dt * size)[:, None])))
 
 
 def growth_shows(step: Step, rates: np.ndarray) -> float:
     """The least dt at which one of these modes grows by `SLOWEST` a step, at least; inf if none does."""
+    rates = filled(rates)
     size = np.abs(rates)
     s = np.logspace(-8, 4, 1201)
     shows = np.asarray(_growth(step, rates / size, np.broadcast_to(s, (len(rates), 1201)))) >= SLOWEST

@@ -328,9 +328,7 @@ class Linearisation:
         if not spectrum.counting.size:
             return math.inf
         if treats_all_alike(step):
-            # always as many, so that one program serves all states
-            rates = np.resize(spectrum.counting, len(spectrum.matrix))
-            return float(np.min(scalar_limits(step, rates, interval)))
+            return float(np.min(scalar_limits(step, spectrum.counting, interval)))
         return self.step_map(spectrum, step).limit(interval)
 
     def step_map(self, spectrum: Spectrum, step: Step) -> StepMap:
