@@ -1,0 +1,172 @@
+"""The same springs from the same data by jeuler and by mujoco.sysid: seconds from the data to the answer, and errors.
+
+    pip install 'mujoco[sysid]'
+    python benchmarks/fits_mujoco.py [N ...]        chains of N masses between two walls, N + 1 springs; 3 20 100
+
+Unit masses on a line, springs as spatial tendons with stiffness and damping of each, 4 s at dt = 0.01 by RK4 in both,
+positions of all masses at 401 times with noise of 1 mm, made by diffrax's Tsit5 at 1e-9. Each fit runs in a process of
+its own without a compilation cache, so that jeuler's seconds hold all of its compilation; imports are counted apart.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+
+begun = time.perf_counter()
+
+
+def chain(count, seed=0):
+    """Positions at rest, velocities, ks and kd of a chain, (particle,) and (spring,)."""
+    import numpy as np
+
+    random = np.random.default_rng(seed)
+    x = np.arange(count + 2.0)
+    v = random.normal(size=count + 2)
+    v[[0, -1]] = 0
+    return x, v, random.uniform(50, 150, count + 1), random.uniform(0.2, 0.8, count + 1)
+
+
+def record(count, path):
+    """What is measured: (time, mass) with noise."""
+    import jax
+    import numpy as np
+    from fits import made
+
+    import jeuler
+
+    jax.config.update("jax_enable_x64", True)
+    x, v, ks, kd = chain(count)
+    edges = np.stack([np.arange(count + 1), np.arange(1, count + 2)], axis=1)
+    mass = np.where(np.isin(np.arange(count + 2), [0, count + 1]), np.inf, 1.0)
+    times = np.linspace(0, 4, 401)
+    y = made(jeuler.Scene((jeuler.Springs(edges, ks, kd, 1.0),)), x[:, None], v[:, None], mass, times)
+    np.save(path, y[:, 1:-1, 0] + 1e-3 * np.random.default_rng(1).normal(size=(401, count)))
+
+
+def by_jeuler(x, v, y):
+    """Fitted ks, kd and the standard errors of ks."""
+    import numpy as np
+
+    import jeuler
+
+    count = len(x) - 2
+    edges = np.stack([np.arange(count + 1), np.arange(1, count + 2)], axis=1)
+    mass = np.where(np.isin(np.arange(count + 2), [0, count + 1]), np.inf, 1.0)
+    positions = np.full((401, count + 2, 1), np.nan)
+    positions[:, 1:-1, 0] = y
+    scene = jeuler.Scene((jeuler.Springs(edges, np.full(count + 1, 80.0), np.full(count + 1, 0.4), 1.0),))
+    state = jeuler.ParticleState(x[:, None], v[:, None], mass)
+    found = jeuler.fit_springs(scene, state, np.linspace(0, 4, 401), positions, dt=0.01, progress=False)
+    return found.ks, found.kd, found.stderr["ks"]
+
+
+def by_mujoco(x, v, y):
+    """The same by mujoco.sysid with its default optimiser, and its intervals over 1.96."""
+    import mujoco
+    import numpy as np
+    from mujoco import sysid
+
+    count = len(x) - 2
+    bodies = "".join(
+        f'<body name="b{k}" pos="{x[k]} 0 0"><joint name="j{k}" type="slide" axis="1 0 0"/>'
+        f'<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><site name="s{k}"/></body>'
+        for k in range(1, count + 1)
+    )
+    tendons = "".join(
+        f'<spatial name="t{k}" stiffness="80" damping="0.4" springlength="1">'
+        f'<site site="s{k}"/><site site="s{k + 1}"/></spatial>'
+        for k in range(count + 1)
+    )
+    sensors = "".join(f'<jointpos name="p{k}" joint="j{k}"/>' for k in range(1, count + 1))
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><option timestep="0.01" integrator="RK4" gravity="0 0 0"><flag contact="disable"/></option>'
+        f'<worldbody><site name="s0"/><site name="s{count + 1}" pos="{x[-1]} 0 0"/>{bodies}</worldbody>'
+        f"<tendon>{tendons}</tendon><sensor>{sensors}</sensor></mujoco>"
+    )
+    model = spec.compile()
+    params = sysid.ParameterDict()
+
+    def modifier(name, field):
+        def write(spec, parameter):
+            value = getattr(spec.tendon(name), field)
+            if np.ndim(value):
+                value[0] = parameter.value[0]
+            else:
+                setattr(spec.tendon(name), field, parameter.value[0])
+
+        return write
+
+    for field, start, high in (("stiffness", 80.0, 1000.0), ("damping", 0.4, 10.0)):
+        for k in range(count + 1):
+            params.add(sysid.Parameter(f"{field}{k}", start, 0.0, high, modifier=modifier(f"t{k}", field)))
+    times = np.linspace(0, 4, 401)
+    sequence = sysid.ModelSequences(
+        "chain",
+        spec,
+        "measured",
+        sysid.create_initial_state(model, np.zeros(count), v[1:-1], np.zeros(0)),
+        sysid.TimeSeries(times, np.zeros((401, 0))),
+        # states, not sensors: those of a step are taken before it, and lag by dt
+        sysid.TimeSeries.from_names(times, y - x[1:-1], model, [f"j{k}_qpos" for k in range(1, count + 1)]),
+    )
+    residual = sysid.build_residual_fn(models_sequences=[sequence])
+    found, result = sysid.optimize(initial_params=params, residual_fn=residual, optimizer="mujoco", verbose=False)
+    residuals, _, _ = residual(result.x, found)
+    _, intervals = sysid.calculate_intervals(residuals, result.jac)
+    return found.as_vector()[: count + 1], found.as_vector()[count + 1 :], intervals[: count + 1] / 1.96
+
+
+def one(tool, count, path):
+    """One fit in this process; prints its numbers."""
+    import numpy as np
+
+    if tool == "jeuler":
+        import jax
+
+        import jeuler  # noqa: F401  # its time is counted apart
+
+        jax.config.update("jax_enable_x64", True)
+    else:
+        from mujoco import sysid  # noqa: F401
+    x, v, ks, kd = chain(count)
+    y = np.load(path)
+    imported = time.perf_counter()
+    with open(os.devnull, "w") as quiet:  # sysid prints its iterations
+        out, sys.stdout = sys.stdout, quiet
+        found_ks, found_kd, error = (np.asarray(a, float) for a in {"jeuler": by_jeuler, "mujoco": by_mujoco}[tool](x, v, y))
+        sys.stdout = out
+    done = time.perf_counter()
+    share = np.mean(np.abs(found_ks - ks) < 1.96 * error)
+    errors = [float(np.median(np.abs(a / b - 1))) for a, b in ((found_ks, ks), (found_kd, kd))]
+    print(json.dumps({"fit": done - imported, "import": imported - begun, "errors": errors, "covered": float(share)}))
+
+
+def main(counts):
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    for count in counts:
+        with tempfile.TemporaryDirectory() as folder:
+            path = os.path.join(folder, "y.npy")
+            record(count, path)
+            seconds = {}
+            for tool in ("jeuler", "mujoco"):
+                command = [sys.executable, __file__, "--one", tool, str(count), path]
+                text = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+                found = json.loads(text.splitlines()[-1])
+                seconds[tool] = found["fit"]
+                ks, kd = found["errors"]
+                print(
+                    f"N = {count}, {tool}: {found['fit']:.2f} s (import {found['import']:.2f} s); "
+                    f"median errors ks {ks:.3%}, kd {kd:.2%}; 95 % intervals of ks hold {found['covered']:.0%}",
+                    flush=True,
+                )
+            print(f"  jeuler takes {seconds['jeuler'] / seconds['mujoco']:.3f} of mujoco.sysid's time")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--one"]:
+        one(sys.argv[2], int(sys.argv[3]), sys.argv[4])
+    else:
+        main([int(n) for n in sys.argv[1:]] or [3, 20, 100])
