@@ -136,7 +136,9 @@ def one(tool, count, path):
     imported = time.perf_counter()
     with open(os.devnull, "w") as quiet:  # sysid prints its iterations
         out, sys.stdout = sys.stdout, quiet
-        found_ks, found_kd, error = (np.asarray(a, float) for a in {"jeuler": by_jeuler, "mujoco": by_mujoco}[tool](x, v, y))
+        found_ks, found_kd, error = (
+            np.asarray(a, float) for a in {"jeuler": by_jeuler, "mujoco": by_mujoco}[tool](x, v, y)
+        )
         sys.stdout = out
     done = time.perf_counter()
     share = np.mean(np.abs(found_ks - ks) < 1.96 * error)

@@ -91,6 +91,8 @@ def as_float(x: ArrayLike | None) -> Array | None:
     kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer) or kind == np.dtype(object)):
         raise TypeError(f"{kind} is not real")
+    if kind != np.dtype(object) and not isinstance(x, jax.Array):
+        x = jnp.asarray(np.asarray(x), jax.dtypes.canonicalize_dtype(kind))  # without a dtype, JAX compiles a program
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
 

@@ -184,7 +184,7 @@ def _batch(axis_data, operands, new_axes, *, jaxpr, size, axes, batched, differe
 
 
 def _is_better_last(jaxpr: Jaxpr, new: Sequence[bool], count: int) -> bool:
-    longest = max(aval.shape[-1] if aval.ndim else 1 for aval in _chosen(jaxpr.in_avals, new))
+    longest = max((aval.shape[-1] if aval.ndim else 1 for aval in _chosen(jaxpr.in_avals, new)), default=0)
     return platforms.batch_last() and count >= MANY and longest <= SHORT and fits(jaxpr.jaxpr, new)
 
 

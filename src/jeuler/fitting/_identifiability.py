@@ -12,7 +12,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.component import result
 from jeuler.fitting.blind import describe_blind
-from jeuler.fitting.least_squares import residual_and_jacobian
+from jeuler.fitting.evaluate import residual_and_jacobian
 from jeuler.fitting.observations import amplitude_of
 from jeuler.fitting.prediction import compiled_positions
 from jeuler.fitting.recorded import Recorded

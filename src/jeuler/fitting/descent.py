@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler.fitting import least_squares
-from jeuler.fitting.least_squares import Evaluate, State, Task
+from jeuler.fitting.evaluate import Evaluate
+from jeuler.fitting.least_squares import State, Task
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import Watch
 from jeuler.fitting.options import Known, Options

@@ -35,7 +35,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
 
         return Outcome(run_traced(problem, options), None)
     known = known or Known()
-    evaluate, task = programs(problem.residual), problem.task(options.tolerance)
+    evaluate, task = programs(problem.residual, problem.data), problem.task(options.tolerance)
     x = np.asarray(problem.x, float)
     if not problem.small and options.optimizer is None:
         from jeuler.fitting.matrix_free import run_matrix_free

@@ -12,24 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-COLUMNS_AT_ONCE = 16
+from jeuler.fitting.evaluate import Evaluate
+from jeuler.fitting.factors import namespace, projected
+
 RUNNING, CONVERGED, ROUNDED, STALLED, NOT_FINITE = range(5)
 TRUSTED = 0.25  # the share of the predicted decrease that a step without damping must keep
 ACCEPTED = 1e-3  # and one with damping
 
-Residual = Callable[[Array, Any], Array]
 Loss = Any  # of `losses`
 Numbers = Any  # an array of NumPy or of JAX
-
-
-def namespace(x: Any) -> Any:
-    """NumPy for what is of NumPy, else jax.numpy."""
-    return np if isinstance(x, (np.ndarray, np.generic, float, int, bool)) else jnp
 
 
 def _while(goes_on: Callable[[Any], Any], body: Callable[[Any], Any], carry: Any, xp: Any) -> Any:
@@ -39,33 +34,6 @@ def _while(goes_on: Callable[[Any], Any], body: Callable[[Any], Any], carry: Any
     while goes_on(carry):
         carry = body(carry)
     return carry
-
-
-class Evaluate(NamedTuple):
-    """How a residual and its Jacobian are come by: compiled, or as part of a program that is being traced.
-
-    Where there are few parameters both come from one program: half as much to compile.
-    """
-
-    residual: Residual
-    both: Callable[[Array, Any], tuple[Array, Array]]
-
-    def __call__(self, x: Any, data: Any) -> tuple[Any, Callable[[], Any]]:
-        """The residual at x, and a function that gives its Jacobian there."""
-        own = (lambda y: np.asarray(y, float)) if namespace(x) is np else (lambda y: y)
-        if len(x) <= COLUMNS_AT_ONCE:
-            r, jacobian = map(own, self.both(x, data))
-            return r, lambda: jacobian
-        return own(self.residual(x, data)), lambda: own(self.both(x, data)[1])
-
-
-def evaluations(residual: Residual, compiled: bool) -> Evaluate:
-    """The two ways to evaluate a residual."""
-
-    def both(x, data):
-        return residual_and_jacobian(residual, x, data)
-
-    return Evaluate(jax.jit(residual), jax.jit(both)) if compiled else Evaluate(residual, both)
 
 
 class Task(NamedTuple):
@@ -179,12 +147,13 @@ def _iterate(evaluate: Evaluate, loss: Loss, state: State, task: Task) -> State:
     taken = xp.isfinite(cost) & (first | ((gain > wanted) & (cost < state.cost)))
 
     def fresh():
-        return xp.where(task.weights > 0, task.weights * slope, 0)[:, None] * linearise()
+        factor = xp.where(task.weights > 0, task.weights * slope, 0)
+        return linearise() if xp is np and (factor == 1).all() else factor[:, None] * linearise()
 
     jacobian = lax.cond(taken, fresh, lambda: state.jacobian) if xp is jnp else (fresh() if taken else state.jacobian)
-    finite = xp.isfinite(cost) & (~taken | xp.all(xp.isfinite(jacobian)))
+    finite = xp.isfinite(cost) & (~taken | xp.isfinite(xp.sum(jacobian)))
     taken = taken & finite
-    jacobian = xp.where(taken, jacobian, state.jacobian)
+    jacobian = xp.where(taken, jacobian, state.jacobian) if xp is jnp else (jacobian if taken else state.jacobian)
     counted = taken & ~first
     state = state._replace(
         x=xp.where(taken, state.trial, state.x),
@@ -203,23 +172,6 @@ def _iterate(evaluate: Evaluate, loss: Loss, state: State, task: Task) -> State:
     return _next_trial(state, task, taken, first & ~finite, weighted * slope)
 
 
-def residual_and_jacobian(residual: Residual, x: Array, data: Any) -> tuple[Array, Array]:
-    """r(x) and dr/dx by forward mode, some columns at a time; the last block is filled up, not a program of its own."""
-
-    def column(direction):
-        return jax.jvp(lambda x: residual(x, data), (x,), (direction,))
-
-    n = len(x)
-    columns = jax.vmap(column, out_axes=(None, 0))
-    if n <= COLUMNS_AT_ONCE:
-        r, rows = columns(jnp.eye(n, dtype=x.dtype))
-        return r, rows.T
-    blocks = -(-n // COLUMNS_AT_ONCE)
-    directions = jnp.eye(blocks * COLUMNS_AT_ONCE, n, dtype=x.dtype).reshape(blocks, COLUMNS_AT_ONCE, n)
-    r, rows = lax.map(columns, directions)
-    return r[0], rows.reshape(blocks * COLUMNS_AT_ONCE, -1)[:n].T
-
-
 def _costs(loss: Loss, raw: Any, task: Task) -> tuple[Any, Any, Any, Any]:
     """Sum of losses, sum of squares of everything, the weighted residual, and what a robust loss makes of it."""
     xp = namespace(raw)
@@ -232,6 +184,10 @@ def _costs(loss: Loss, raw: Any, task: Task) -> tuple[Any, Any, Any, Any]:
 def column_norms(jacobian: Any) -> Any:
     """The norms of the columns, without over- or underflow of the squares."""
     xp = namespace(jacobian)
+    if xp is np:
+        squares = np.einsum("ij,ij->j", jacobian, jacobian)
+        if ((squares > 1e-200) & (squares < 1e200)).all():
+            return np.sqrt(squares)
     largest = xp.max(xp.abs(jacobian), axis=0, initial=0)
     safe = xp.where(largest > 0, largest, 1)
     return largest * xp.sqrt(xp.sum((jacobian / safe) ** 2, axis=0))
@@ -252,10 +208,12 @@ def _damping(state: State, gain: Any, taken: Any, first: Any) -> dict[str, Any]:
 def _next_trial(state: State, task: Task, taken: Any, lost: Any, at_trial: Any) -> State:
     """The damped step to the next trial, and whether the search is at its end."""
     xp = namespace(state.x)
-    q, triangle = projected(state.jacobian, xp.stack([state.bent, at_trial], axis=1), state.scale)
+    scaled = state.jacobian / xp.where(state.scale > 0, state.scale, 1)
+    q, triangle = projected(scaled, xp.stack([state.bent, at_trial], axis=1))
     model = _Model(q[:, 0], triangle, state.scale, state.x, task.lower, task.upper)
     step, predicted = _bounded_step(model, state.damping)
-    step = step + xp.where(taken, 0, _around_the_bend(model, state.trial, q[:, 1], step, state.damping))
+    if xp is jnp or not taken:
+        step = step + xp.where(taken, 0, _around_the_bend(model, state.trial, q[:, 1], step, state.damping))
     newton = _newton_decrease(model)
     freedom = xp.maximum(xp.sum(task.weights > 0) - len(state.x), 1)
     left = xp.maximum(state.cost - newton, xp.finfo(state.x.dtype).tiny)
@@ -305,13 +263,6 @@ class _Model(NamedTuple):
     def slope(self, s: Array) -> Array:
         """Half the gradient of the model by D s."""
         return self.triangle.T @ (self.q + self.triangle @ s)
-
-
-def projected(jacobian: Any, residual: Any, scale: Any) -> tuple[Any, Any]:
-    """Q^T r and R of the QR decomposition of J D^-1."""
-    xp = namespace(jacobian)
-    q, triangle = xp.linalg.qr(jacobian / xp.where(scale > 0, scale, 1))
-    return q.T @ residual, triangle
 
 
 def _held(model: _Model, s: Any) -> Any:

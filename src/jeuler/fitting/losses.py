@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jeuler.fitting.least_squares import namespace
+from jeuler.fitting.factors import namespace
 
 
 class Loss(NamedTuple):

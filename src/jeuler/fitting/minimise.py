@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from jeuler.fitting import least_squares
+from jeuler.fitting.evaluate import Evaluate
 from jeuler.fitting.kept import Record
-from jeuler.fitting.least_squares import Evaluate, State, Task, again, start
+from jeuler.fitting.least_squares import State, Task, again, start
 from jeuler.fitting.losses import LOSSES, Loss
 
 ROUGH = 0.1  # standard errors: near enough for what is only a stage

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler._core import checks
 from jeuler._core.component import parameters_of, replace
 from jeuler.forces.springs import Springs
 from jeuler.particles.scene import Scene
@@ -88,7 +89,8 @@ class Places:
                 if not rows.size:
                     kind = "pinned (mass = inf)" if name == "anchors" else "free"
                     raise ValueError(f"parameters names {name!r}, but the state has no {kind} particle")
-                start[name] = getattr(state, "position" if name == "anchors" else name)[rows]
+                values = getattr(state, "position" if name == "anchors" else name)
+                start[name] = values[rows] if checks.is_traced(values) else np.asarray(values)[rows]
         if self.where is not None:
             start[WHERE] = self._picked(scene)
         self._refuse_twice(scene)

@@ -13,8 +13,10 @@ import numpy as np
 from jax import Array
 
 from jeuler._core.interpolate import hermite
+from jeuler.fitting.forward import Forward
 from jeuler.fitting.observations import place_in_steps
 from jeuler.fitting.parameters import Places
+from jeuler.fitting.unknowns import Layout
 from jeuler.particles._simulate import simulate
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -48,6 +50,14 @@ class Prediction:
         p, v = run.y
         k, s = data["interval"], data["fraction"].astype(p.dtype)[:, None, None]
         return hermite(s, data["dt"].astype(p.dtype), p[k], p[k + 1], v[k], v[k + 1])
+
+    def form(self, data: dict[str, Any]) -> jax.ShapeDtypeStruct:
+        """The form of the residual."""
+        return jax.ShapeDtypeStruct(data["targets"].shape, data["state"].position.dtype)
+
+    def forward(self, layout: Layout, data: dict[str, Any]) -> Forward:
+        """The same with derivatives by forward mode, in one program of its own."""
+        return Forward.of(self, layout, data)
 
     def __call__(self, params: dict[str, Any], data: dict[str, Any]) -> Array:
         """Prediction minus measurement where something was observed, 0 elsewhere, (time, column), m."""

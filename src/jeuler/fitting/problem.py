@@ -14,8 +14,10 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.partition import arrays_only
-from jeuler.fitting.least_squares import Evaluate, Task, evaluations
+from jeuler._core.partition import OfArrays, arrays_only
+from jeuler._jax.programs import is_transformed
+from jeuler.fitting.evaluate import Evaluate, evaluations
+from jeuler.fitting.least_squares import Task
 from jeuler.fitting.unknowns import Layout, checked_bounds
 
 PyTree = Any
@@ -44,9 +46,22 @@ def kept_programs(residual: FlatResidual) -> Evaluate:
     return evaluations(residual, compiled=True)
 
 
-def programs(residual: FlatResidual) -> Evaluate:
-    """The compiled programs of a residual. One that closes over its data may read others next time: nothing is kept."""
-    return kept_programs(residual) if residual.with_data else evaluations(residual, compiled=True)
+def programs(residual: FlatResidual, data: Any) -> Evaluate:
+    """The compiled programs of a residual. One that closes over its data may read others next time: nothing is kept.
+
+    A residual that has its own way to run with derivatives, ``forward``, is run by that.
+    """
+    evaluate = kept_programs(residual) if residual.with_data else evaluations(residual, compiled=True)
+    function: Any = residual.residual
+    whole: Callable[..., Any] | None = None
+    if isinstance(function, OfArrays):
+        function, whole = function.function, function.rest.join
+    if not hasattr(function, "forward"):
+        return evaluate
+    forward = function.forward(residual.layout, data if whole is None else whole(data))
+    return dataclasses.replace(
+        evaluate, at=lambda x, data: forward.residual_at(x, data if whole is None else whole(data))
+    )
 
 
 def residual_layout(residual: Callable[..., Any], params: PyTree, data: Any, with_data: bool) -> tuple[Layout, bool]:
@@ -58,6 +73,8 @@ def residual_layout(residual: Callable[..., Any], params: PyTree, data: Any, wit
         "with data=..., it is called as residual(params, data)",
     )
     layout = Layout.of(params)
+    if hasattr(residual, "form") and not is_transformed():  # it says so itself, and nothing is traced
+        return Layout.of(residual.form(data)), False
     flat = jax.ShapeDtypeStruct((layout.size,), layout.dtype)
     if with_data:
         program, form = jax.make_jaxpr(lambda x, data: residual(layout.params(x), data), return_shape=True)(flat, data)

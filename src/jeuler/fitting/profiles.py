@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jeuler.fitting import least_squares
-from jeuler.fitting.least_squares import Evaluate, State, Task
+from jeuler.fitting.evaluate import Evaluate
+from jeuler.fitting.least_squares import State, Task
 from jeuler.fitting.losses import Loss
 
 if TYPE_CHECKING:

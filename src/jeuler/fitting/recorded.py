@@ -12,6 +12,7 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler.fitting.engine import Outcome, run
+from jeuler.fitting.forward import Forward
 from jeuler.fitting.observations import (
     amplitude_of,
     checked_observations,
@@ -27,6 +28,7 @@ from jeuler.fitting.problem import Problem
 from jeuler.fitting.result import Fit
 from jeuler.fitting.sampling import aliased
 from jeuler.fitting.step_bias import bias_of_step
+from jeuler.fitting.unknowns import Layout
 from jeuler.fitting.weak_form import weak_form
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -215,7 +217,12 @@ class Recorded:
         data, bias = self.data, None
         if self.traced:
             return fields, None, scene, state, self.prediction.positions(found.params, data)
-        predicted = compiled_positions(self.prediction)(found.params, data)
+        if outcome.state is None:  # no derivatives were compiled
+            predicted = compiled_positions(self.prediction)(found.params, data)
+        else:
+            layout = Layout.of(found.params)
+            forward = Forward.of(self.prediction, layout, data)
+            predicted = jnp.asarray(forward.positions(layout.vector(found.params), data), self.state.position.dtype)
         words = aliased(self.scene, scene, state, self.times)
         if step_bias and found.covariance is not None and outcome.state is not None:
             bias, more = bias_of_step(self, found, outcome.state)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jeuler.fitting import least_squares
 from jeuler.fitting.blind import describe_blind
+from jeuler.fitting.factors import namespace
 from jeuler.fitting.least_squares import State
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import Watch
 from jeuler.fitting.options import Known
 from jeuler.fitting.problem import Problem, series_of
 from jeuler.fitting.result import Fit, Verdict
-from jeuler.fitting.uncertainty import Uncertainty, directions, uncertainty
+from jeuler.fitting.uncertainty import Uncertainty, uncertainty
 from jeuler.fitting.unknowns import Layout, readable
 
 NOT_FINITE = (
@@ -73,7 +73,7 @@ def report(
         **quality,
     )
     return Fit(
-        params=layout.params(jnp.asarray(x)),
+        params=layout.params(x),
         loss=total / size,
         history=np.asarray(history) / size,
         stderr=errors.stderr,
@@ -83,7 +83,7 @@ def report(
         undetermined=errors.undetermined,
         nonfinite=int(state.nonfinite),
         stderr_white=errors.white,
-        residual=problem.form.params(jnp.asarray(state.residual)),
+        residual=problem.form.params(np.asarray(state.residual)),
         blind=errors.blind,
         at_bound=tuple(np.asarray(layout.names())[held]),
         starts=starts,
@@ -114,12 +114,11 @@ def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors
         error, white = (
             np.where(found.blind, np.inf, np.sqrt(np.maximum(np.diag(c), 0))) for c in (found.covariance, found.white)
         )
-        null = directions(state.jacobian, problem.precision).null()
-        blind = describe_blind(null, x, layout.names(readable), np.asarray(problem.lower) >= 0)
+        blind = describe_blind(found.directions.null(), x, layout.names(readable), np.asarray(problem.lower) >= 0)
     doubtful = (problem.lower == 0) & (x > 0) & (error > x) & ~found.blind
     return _Errors(
-        stderr=layout.params(jnp.asarray(error)),
-        white=layout.params(jnp.asarray(white)),
+        stderr=layout.params(error),
+        white=layout.params(white),
         covariance=found.covariance,
         undetermined=tuple(name for name, out in zip(layout.names(), found.blind, strict=True) if out),
         blind=blind,
@@ -144,9 +143,9 @@ def _kept(layout: Layout) -> tuple[str, ...]:
 
 def errors_of(problem: Problem, state: State, spread: Any, loss: str) -> Uncertainty:
     """Covariances at the end of a search; a robust loss counts an outlier by its influence."""
-    xp = least_squares.namespace(state.x)
+    xp = namespace(state.x)
     _, slope = LOSSES[loss](state.residual / spread)
-    jacobian = state.jacobian / xp.where(slope > 0, slope, 1)[:, None]
+    jacobian = state.jacobian if loss == "linear" else state.jacobian / xp.where(slope > 0, slope, 1)[:, None]
     curvature = LOSSES[loss].curvature(state.residual / spread)
     influence = state.residual * slope**2
     counted = problem.weights > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,17 +67,24 @@ def _near_samples(grid: np.ndarray, t: np.ndarray, spacing: float) -> np.ndarray
     return (t[k] - t[k - 1] <= 3 * spacing) & (grid >= t[0]) & (grid <= t[-1])
 
 
-def bumps(grid: np.ndarray, half_width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bumps (1 - z^2)^4 that overlap by half, their second derivatives, and where they are not 0, each (bump, fine).
+def bumps(grid: np.ndarray, half_width: float) -> tuple[Any, Any, Any]:
+    """Bumps (1 - z^2)^4 that overlap by half, their second derivatives, and 1 where they are not 0: sparse, (bump,
+    fine).
 
     Each row is multiplied by the step of the grid, so that a product with it is an integral.
     """
+    from scipy.sparse import csr_matrix
+
     step = grid[1] - grid[0]
     first, last = grid[0] + half_width, grid[-1] - half_width
     count = int(np.floor((last - first) / (half_width / 2) + 1e-9)) + 1 if last >= first else 0
     centres = np.linspace(first, last, count) if count > 1 else np.array([(first + last) / 2] * count)
-    z = (grid[None, :] - centres[:, None]) / half_width
-    inside = np.abs(z) < 1
-    c = np.where(inside, 1 - z**2, 0)
+    low = np.searchsorted(grid, centres - half_width, side="right")
+    high = np.searchsorted(grid, centres + half_width, side="left")
+    ends = np.concatenate([[0], np.cumsum(high - low)])
+    columns = np.arange(ends[-1]) + np.repeat(low - ends[:-1], high - low)
+    z = (grid[columns] - np.repeat(centres, high - low)) / half_width
+    c = 1 - z**2
     second = (48 * z**2 * c**2 - 8 * c**3) / half_width**2
-    return c**4 * step, second * step, inside
+    shape = count, len(grid)
+    return tuple(csr_matrix((x, columns, ends), shape) for x in (c**4 * step, second * step, np.ones_like(z)))

@@ -11,7 +11,8 @@ import numpy as np
 
 from jeuler._core import checks
 from jeuler.fitting import least_squares
-from jeuler.fitting.least_squares import Evaluate, State, Task, start
+from jeuler.fitting.evaluate import Evaluate
+from jeuler.fitting.least_squares import State, Task, start
 from jeuler.fitting.losses import LOSSES, Loss
 from jeuler.fitting.minimise import Watch
 from jeuler.fitting.options import Options
@@ -96,4 +97,4 @@ def many_starts(
 
 def _known(value: np.ndarray, jacobian: np.ndarray) -> Evaluate:
     """An evaluation whose result is there already."""
-    return Evaluate(lambda x, data: value, lambda x, data: (value, jacobian))  # type: ignore[arg-type,return-value]
+    return Evaluate(lambda x, data: value, lambda x, data: (value, jacobian), lambda x, data: (value, lambda: jacobian))  # type: ignore[arg-type,return-value]

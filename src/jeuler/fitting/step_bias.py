@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jeuler.fitting import least_squares
+from jeuler.fitting.factors import projected
+from jeuler.fitting.forward import Forward
 from jeuler.fitting.least_squares import State
-from jeuler.fitting.prediction import Prediction, recording
+from jeuler.fitting.prediction import recording
 from jeuler.fitting.result import Fit
 from jeuler.fitting.unknowns import Layout, readable
 
@@ -21,11 +18,6 @@ if TYPE_CHECKING:
     from jeuler.fitting.recorded import Recorded
 
 TENTH = 0.1  # of a standard error: the least that is worth a word
-
-
-@functools.lru_cache(maxsize=32)
-def _compiled(prediction: Prediction) -> Callable[..., Any]:
-    return jax.jit(prediction)
 
 
 def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[str]]:
@@ -40,17 +32,17 @@ def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[st
     Source: the extrapolation of L. F. Richardson; the projection is the Gauss-Newton step.
     """
     layout = Layout.of(found.params)
-    whole, half = _residuals(task, found, 1), _residuals(task, found, 2)
+    whole, half = _residuals(task, layout, found)
     if not np.isfinite(half).all():
         return None, [f"at dt = {task.dt / 2:g} the run is not finite, so the bias of the step is not known"]
     with np.errstate(all="ignore"):
-        weights = np.where(whole.ravel() != 0, state.residual / whole.ravel(), 0)
+        weights = np.where(whole != 0, state.residual / whole, 0)
     order = getattr(task.prediction.step, "order", 1)
     jump = 2**order / (2**order - 1)
-    shift = _shift(state, (half - whole).ravel() * jump * weights)
+    shift = _shift(state, (half - whole) * jump * weights)
     error = np.asarray(layout.vector(found.stderr), float)
     share = np.where(np.isfinite(error) & (error > 0), np.abs(shift) / np.where(error > 0, error, 1), 0)
-    bias = layout.params(jnp.asarray(shift))
+    bias = layout.params(shift)
     worst = int(np.argmax(share)) if share.size else 0
     if not share.size or share[worst] <= TENTH:
         return bias, []
@@ -63,25 +55,19 @@ def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[st
     ]
 
 
-def _residuals(task: Recorded, found: Fit, parts: int) -> np.ndarray:
-    """The residual in steps of dt / parts, weighted as in the fit."""
-    steps = task.prediction.num_steps * parts
-    prediction = dataclasses.replace(task.prediction, num_steps=steps)
-    data = recording(
-        task.scene,
-        task.state,
-        task.times,
-        task.targets,
-        prediction.columns,
-        dt=task.dt / parts,
-        t0=task.t0,
-        num_steps=steps,
+def _residuals(task: Recorded, layout: Layout, found: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """The residuals in steps of dt and of dt / 2."""
+    steps = task.prediction.num_steps * 2
+    x, columns = np.asarray(layout.vector(found.params), float), task.prediction.columns
+    halved = recording(
+        task.scene, task.state, task.times, task.targets, columns, dt=task.dt / 2, t0=task.t0, num_steps=steps
     )
-    return np.asarray(_compiled(prediction)(found.params, data), float)
+    forward = Forward.of(task.prediction, layout, task.data)
+    return forward.residual_at(x, task.data)[0], forward.residual_at(x, halved, parts=2)[0]
 
 
 def _shift(state: State, change: np.ndarray) -> np.ndarray:
     """J^+ of a change of the weighted residual."""
-    q, triangle = least_squares.projected(state.jacobian, change, state.scale)
-    step = -least_squares.damped_solution(triangle, q, np.asarray(0.0))
-    return step / np.where(state.scale > 0, state.scale, 1)
+    scale = np.where(state.scale > 0, state.scale, 1)
+    q, triangle = projected(state.jacobian / scale, change[:, None])
+    return -least_squares.damped_solution(triangle, q[:, 0], np.asarray(0.0)) / scale

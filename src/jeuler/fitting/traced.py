@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler.fitting import least_squares
-from jeuler.fitting.least_squares import State, Task, advance, again, evaluations, start
+from jeuler.fitting.evaluate import evaluations
+from jeuler.fitting.least_squares import State, Task, advance, again, start
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import ROUGH, TUNING
 from jeuler.fitting.options import Options

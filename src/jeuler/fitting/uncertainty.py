@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jeuler.fitting.least_squares import column_norms, namespace
+from jeuler.fitting.factors import namespace, singular
+from jeuler.fitting.least_squares import column_norms
 
 MOST_LAGS = 8
 LARGE = 2**22  # numbers in a Jacobian beyond which a bound on the correlation's effect must do
@@ -55,6 +56,7 @@ class Uncertainty(NamedTuple):
       blind: which parameters take part in a direction that does not change the residual, (n,).
       autocorrelation: of the residual at lag one, corrected for the fit, ().
       variance: of the weighted noise, ().
+      directions: of the Jacobian.
     """
 
     covariance: Any
@@ -62,6 +64,7 @@ class Uncertainty(NamedTuple):
     blind: Any
     autocorrelation: Any
     variance: Any
+    directions: Directions
 
 
 def directions(jacobian: Any, precision: float) -> Directions:
@@ -73,10 +76,10 @@ def directions(jacobian: Any, precision: float) -> Directions:
     """
     xp = namespace(jacobian)
     norms = column_norms(jacobian)
-    q, triangle = xp.linalg.qr(jacobian / xp.where(norms > 0, norms, 1))
-    u, values, vt = xp.linalg.svd(triangle, full_matrices=False)
+    norms = xp.where(norms > 0, norms, 1)
+    left, values, vectors = singular(jacobian / norms)
     seen = values > 2e3 * precision * xp.max(values, initial=0)
-    return Directions(xp.where(norms > 0, norms, 1), values, vt.T, seen, q @ u)
+    return Directions(norms, values, vectors, seen, left)
 
 
 def uncertainty(
@@ -103,10 +106,9 @@ def uncertainty(
     rank = xp.sum(d.seen)
     freedom = xp.sum(counted) - rank
     half = d.vectors * xp.where(d.seen, 1 / xp.where(d.seen, d.values, 1), 0) / d.norms[:, None]  # J = Q S V^T
-    bread = xp.where(d.seen, 1.0, 0.0)[:, None] * d.left.T  # rows of Q^T, those seen
-    shape = _inverse(bread @ (curvature[:, None] * bread.T), d.seen, xp)  # (Q^T diag(curvature) Q)^-1
+    basis = d.left if xp is np and d.seen.all() else xp.where(d.seen, d.left, 0)
+    shape = _inverse(basis.T @ _times(curvature, basis, xp), d.seen, xp)  # (Q^T diag(curvature) Q)^-1
     lags = _lags(series, n, m)
-    basis = xp.where(d.seen, d.left, 0)
     gamma = autocovariances(residual, counted, basis, series, lags, xp)
     enough = freedom > 0
     variance = xp.sum(residual**2) / xp.where(enough, freedom, 1)
@@ -118,7 +120,8 @@ def uncertainty(
     unit = 1 / xp.where(gamma[0] > 0, gamma[0], 1) if absolute else 1.0
     meat = unit * _through(basis, noise, series, xp)
     correlated = half @ shape @ meat @ shape @ half.T
-    wider = _student(_sensitivity(basis @ (half @ shape).T, noise, series, xp), noise, xp.sum(counted), xp)
+    influence = None if basis.size > LARGE else basis @ (half @ shape).T
+    wider = _student(_sensitivity(influence, n, noise, series, xp), noise, xp.sum(counted), xp)
     correlated = correlated * wider[:, None] * wider[None, :]
     use = xp.all(xp.isfinite(correlated)) & enough & (noise.order > 0)
     correlated = xp.where(use, correlated, white)
@@ -137,7 +140,12 @@ def _result(
     if len(gamma) > 1:
         rho = xp.where(gamma[0] > 0, gamma[1] / xp.where(gamma[0] > 0, gamma[0], 1), 0.0)
     # blind: what takes part in a direction that nothing shows
-    return Uncertainty(correlated, white, silent > 1e-6, xp.clip(rho, -1, 1), variance)
+    return Uncertainty(correlated, white, silent > 1e-6, xp.clip(rho, -1, 1), variance, d)
+
+
+def _times(curvature: Any, basis: Any, xp: Any) -> Any:
+    """diag(curvature) Q; Q itself for squares."""
+    return basis if xp is np and (curvature == 1).all() else curvature[:, None] * basis
 
 
 def _inverse(matrix: Any, seen: Any, xp: Any) -> Any:
@@ -276,10 +284,10 @@ def _through(basis: Any, noise: Noise, series: Series, xp: Any) -> Any:
     return total
 
 
-def _sensitivity(influence: Any, noise: Noise, series: Series, xp: Any) -> Any:
+def _sensitivity(influence: Any, n: int, noise: Noise, series: Series, xp: Any) -> Any:
     """d log variance / d phi of each parameter, (n, lags), from what each residual adds to it, (m, n)."""
-    if influence.size > LARGE:
-        return xp.zeros((influence.shape[1], len(noise.coefficients)))
+    if influence is None:
+        return xp.zeros((n, len(noise.coefficients)))
     variance, slope = 0.0, 0.0
     for g in _parts(influence, series):
         share, by_phi = noise.spectrum(_length(len(g)), xp)

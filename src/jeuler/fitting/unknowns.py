@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.tree_util import keystr
 
 from jeuler._core import checks
@@ -72,7 +71,7 @@ class Layout:
         parts = [xp.ravel(xp.asarray(x, self.dtype)) for x in leaves]
         return xp.concatenate(parts) if parts else np.zeros(0, self.dtype)
 
-    def params(self, x: Array) -> PyTree:
+    def params(self, x: Any) -> PyTree:
         """The parameters of a vector."""
         leaves, start = [], 0
         for shape, dtype in zip(self.shapes, self.dtypes, strict=True):

@@ -24,7 +24,7 @@ from jeuler.particles.fields import declared
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
-HALF_WIDTHS = (3.0, 4.5, 7.0, 11.0, 18.0, 30.0)  # of the bumps, in samples
+HALF_WIDTHS = (30.0, 18.0, 11.0, 7.0, 4.5, 3.0)  # of the bumps, in samples
 MOST_DENSE = 64  # numbers of a force that is differentiated as a whole
 
 
@@ -46,8 +46,8 @@ class WeakForm:
 class Rows:
     """The rows of the linear problem: one for each free particle, bump and component."""
 
-    bump: np.ndarray
-    second: np.ndarray
+    bump: Any
+    second: Any
     tracks: Tracks
     mass: np.ndarray
     used: np.ndarray
@@ -55,9 +55,9 @@ class Rows:
     count: int
 
     def __init__(self, tracks: Tracks, mass: np.ndarray, edges: list[np.ndarray], half_width: float) -> None:
-        self.bump, self.second, inside = bumps(tracks.times, half_width)
+        self.bump, self.second, inside = bumps(tracks.times, half_width)  # sparse: a bump is short
         self.tracks, self.mass = tracks, mass
-        unknown = (inside.astype(float) @ (~tracks.known).astype(float)) > 0  # (bump, particle)
+        unknown = inside @ (~tracks.known).astype(float) > 0  # (bump, particle)
         spoilt = unknown.copy()
         for pairs in edges:
             for a, b in (pairs.T, pairs.T[::-1]):
@@ -71,18 +71,17 @@ class Rows:
 
     def of_particles(self, field: np.ndarray) -> np.ndarray:
         """The integrals of bump times a force (fine, particle, dim), over the mass, as rows."""
-        integral = np.einsum("bf,fpd->pbd", self.bump, field, optimize=True)
-        return (integral / self.mass[:, None, None])[self.used].ravel()
+        return (_integrals(self.bump, field) / self.mass[:, None, None])[self.used].ravel()
 
     def acceleration(self) -> np.ndarray:
         """The integrals of the second derivative of the bumps times the position: the left-hand side."""
-        return np.einsum("bf,fpd->pbd", self.second, self.tracks.position, optimize=True)[self.used].ravel()
+        return _integrals(self.second, self.tracks.position)[self.used].ravel()
 
     def of_springs(self, pairs: np.ndarray, on_first: np.ndarray) -> Any:
         """A sparse matrix (row, spring) from the force on the first end of each spring, (fine, spring, dim)."""
         from scipy.sparse import coo_matrix
 
-        integral = np.einsum("bf,fsd->sbd", self.bump, on_first, optimize=True)
+        integral = _integrals(self.bump, on_first)
         rows, columns, values = [], [], []
         for end, sign in ((0, 1.0), (1, -1.0)):
             place = self.number[pairs[:, end]]  # (spring, bump, dim)
@@ -93,6 +92,12 @@ class Rows:
             columns.append(np.broadcast_to(np.arange(len(pairs))[:, None, None], place.shape)[keep])
         triple = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
         return coo_matrix(triple, shape=(self.count, len(pairs))).tocsc()
+
+
+def _integrals(bump: Any, field: np.ndarray) -> np.ndarray:
+    """The integrals of bumps times a field (fine, item, dim), (item, bump, dim)."""
+    flat = bump @ np.ascontiguousarray(field.reshape(len(field), -1))
+    return flat.reshape(-1, *field.shape[1:]).transpose(1, 0, 2)
 
 
 def weak_form(
@@ -108,8 +113,10 @@ def weak_form(
     for samples in HALF_WIDTHS:
         half_width = samples * tracks.spacing
         if half_width > 0.25 * (tracks.times[-1] - tracks.times[0]):
-            break
+            continue
         found = _solve(scene, tracks, mass, places, start, half_width)
+        if found is not None and best is not None and found[0] > 2 * best[0]:
+            break  # narrower ones see more of the noise
         if found is not None and (best is None or found[0] < best[0]):
             best = found
     if best is None:
@@ -121,9 +128,10 @@ def weak_form(
 
 def with_pinned(tracks: Tracks, state: ParticleState, places: Places) -> Tracks:
     """The tracks with pinned particles that were not observed at their places."""
+    position = np.asarray(state.position, float)
     for particle in places.pinned:
         if not tracks.known[:, particle].any():
-            tracks.position[:, particle] = np.asarray(state.position[particle], float)
+            tracks.position[:, particle] = position[particle]
             tracks.velocity[:, particle] = 0
             tracks.known[:, particle] = True
     return tracks

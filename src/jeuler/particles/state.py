@@ -184,6 +184,8 @@ def _array(name: str, value: Any) -> Array:
     if isinstance(value, jax.Array):
         return value
     try:
+        if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":  # without a dtype, JAX compiles a program
+            return jnp.asarray(value, jax.dtypes.canonicalize_dtype(value.dtype))
         return jnp.asarray(value)
     except (TypeError, ValueError):
         raise ValueError(f"ParticleState.{name} must be an array of numbers, got {checks.shown(value)}") from None

@@ -274,7 +274,8 @@ def advance_by(step: Any, *, compensated: bool) -> Callable[..., Any]:
             checks.same_form("the step", y, y_next)
             return y_next, None
 
-        return recomputed(plain) if hasattr(step, "increment") else plain
+        forward_only = getattr(step, "in_loop", False)
+        return recomputed(plain) if hasattr(step, "increment") and not forward_only else plain
 
     if not hasattr(step, "increment"):
         name = getattr(step, "__name__", repr(step))
