@@ -46,6 +46,7 @@ def parser() -> Parser:
     add = fit.add_argument
     add("--plot", metavar="OUT.png", help="where the picture goes (default jeuler_fit.png); - is standard output")
     add("--json", metavar="OUT.json", help="write the result as JSON too; - is standard output")
+    add("--report", metavar="OUT.html", help="write the fit as one HTML page too, which needs no network")
     add("--max-iterations", type=int, default=200, help="the most iterations of each stage of the fit (default 200)")
     look = jobs.add_parser(
         "look",

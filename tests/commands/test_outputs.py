@@ -34,6 +34,10 @@ def run(capsys, *arguments):
         (["--json", "good.csv"], "--json good.csv: is the measured file itself"),
         (["--json", "link.csv"], "--json link.csv: is the measured file itself"),
         (["--plot", "same.png", "--json", "same.png"], "must be different files"),
+        (["--report", "good.csv"], "--report good.csv: is the measured file itself"),
+        (["--report", "same.html", "--json", "same.html"], "--json and --report must be different files"),
+        (["--report", "-", "--json", "-"], "one output at most can be -"),
+        (["--report", "nodir/a.html"], "--report nodir/a.html: there is no folder"),
         (["--plot", "nodir/a.png"], "--plot nodir/a.png: there is no folder"),
         (["--json", "nodir/a.json"], "--json nodir/a.json: there is no folder"),
         (["--plot", "adir"], "--plot adir: is a folder"),
@@ -110,10 +114,20 @@ def test_json_to_standard_output_link_and_pipe(folder, capsys):
     assert run(capsys, "fit", "good.csv", "--mass", 0.25, "--json", "link.json")[0] == 0
     assert (folder / "link.json").is_symlink()
     assert json.loads((folder / "target.json").read_text())["springs"] == told["springs"]
-    assert run(capsys, "fit", "good.csv", "--mass", 0.25, "--json", "pipe", "--plot", "fit.svg")[0] == 0
+    assert (
+        run(capsys, "fit", "good.csv", "--mass", 0.25, "--json", "pipe", "--plot", "fit.svg", "--report", "fit.html")[0]
+        == 0
+    )
     reader.join(20)
     assert json.loads(got[0])["springs"] == told["springs"]
     assert (folder / "fit.svg").read_text().lstrip().startswith("<?xml")
+    page = (folder / "fit.html").read_text()
+    assert f"{told['springs'][0]['ks']:.6g}" in page
+    assert f"{told['springs'][0]['ks'] - 1.96 * told['springs'][0]['ks_stderr']:.6g} to " in page
+    assert "natural frequency" in page
+    code, out, error = run(capsys, "fit", "good.csv", "--mass", 0.25, "--report", "-")
+    assert (code, out.count("<!doctype html>")) == (0, 1)
+    assert "natural frequency" in error
 
 
 def test_names_that_a_picture_or_a_terminal_would_take_amiss(folder, capsys):

@@ -17,6 +17,7 @@ from jeuler.fitting import fit
 from jeuler.fitting.observations import horizons
 from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes, modes_of
 from jeuler.fitting.spectrum import strong_lines
+from jeuler.fitting.unknowns import Layout, readable
 from jeuler.particles.scene import Scene
 
 STEPS_A_PERIOD, FEWER_STEPS = 80, 40  # the second where the first would be more than MANY_STEPS
@@ -36,6 +37,7 @@ class Estimate:
       at_zero: the parameters that ended at their bound 0, in words.
       predicted: at the measured times, (time, particle, dim).  dt: step size, s.
       loss: mean square of the residual.  iterations, converged, message: of the descent.  scene, mass: as fitted.
+      correlation: names of the fitted numbers and the correlation of their errors.  history: the loss.
     """
 
     model: Model
@@ -51,6 +53,8 @@ class Estimate:
     message: str
     scene: Scene
     mass: np.ndarray
+    correlation: tuple[tuple[str, ...], np.ndarray] | None = None
+    history: Any = ()
 
     @property
     def modes(self) -> list[Mode]:
@@ -186,6 +190,8 @@ def estimate(
         message="converged" if found.converged else f"not converged in {len(found.history)} iterations",
         scene=scene,
         mass=np.asarray(state.mass)[:n],
+        correlation=None if found.covariance is None else (Layout.of(found.params).names(readable), found.correlation),
+        history=found.history,
     )
 
 

@@ -19,6 +19,7 @@ from jeuler.commands.cautions import cautions
 from jeuler.commands.estimate import Estimate, estimate, guess_of, step_size
 from jeuler.commands.linear_start import band_limited
 from jeuler.commands.model import Model
+from jeuler.commands.page import page
 from jeuler.commands.picture import draw
 from jeuler.commands.report import lines, report
 from jeuler.commands.selection import Measurement, recordings_in, select, together
@@ -32,7 +33,7 @@ STANDARD_OUTPUT = "-"
 def fit_file(arguments: argparse.Namespace, started: float) -> None:
     """Read, fit, print, draw."""
     picture = DEFAULT_PICTURE if arguments.plot is None else arguments.plot
-    _check_outputs(arguments.files, picture, arguments.json)
+    _check_outputs(arguments.files, {"--plot": picture, "--json": arguments.json, "--report": arguments.report})
     for option in ("begin", "end"):
         options.check_number({"begin": "--from", "end": "--to"}[option], getattr(arguments, option))
     options.check_number("--dt", arguments.dt, positive=True)
@@ -137,12 +138,10 @@ def _fit(
     return tried[best], compared
 
 
-def _check_outputs(files: list[str], picture: str, text: str | None) -> None:
+def _check_outputs(files: list[str], asked: dict[str, str | None]) -> None:
     """Refuse before the work what would be refused after it, or would destroy what was measured."""
-    outputs = {"--plot": picture} | ({"--json": text} if text is not None else {})
+    outputs = {option: path for option, path in asked.items() if path is not None and path != STANDARD_OUTPUT}
     for option, path in outputs.items():
-        if path == STANDARD_OUTPUT:
-            continue
         try:
             check_output(path)
         except ValueError as error:
@@ -150,8 +149,14 @@ def _check_outputs(files: list[str], picture: str, text: str | None) -> None:
         for file in files:
             if os.path.exists(file) and os.path.realpath(file) == os.path.realpath(path):
                 raise ValueError(f"{option} {path}: is the measured file itself; give another name")
-    if text is not None and os.path.realpath(picture) == os.path.realpath(text) and not _is_stream(text):
-        raise ValueError(f"--plot and --json must be different files, got {picture} for both")
+    if list(asked.values()).count(STANDARD_OUTPUT) > 1:
+        raise ValueError(f"one output at most can be {STANDARD_OUTPUT}, standard output; give the others a name")
+    plain = [(option, path) for option, path in outputs.items() if not _is_stream(path)]
+    for k, (option, path) in enumerate(plain):
+        for other, earlier in plain[:k]:
+            if os.path.realpath(path) == os.path.realpath(earlier):
+                raise ValueError(f"{other} and {option} must be different files, got {path} for both")
+    picture = asked["--plot"] or DEFAULT_PICTURE
     ending = os.path.splitext(os.path.realpath(picture))[1].lower()
     if picture != STANDARD_OUTPUT and not _is_stream(picture) and ending not in PICTURES:
         raise ValueError(
@@ -180,6 +185,10 @@ def _write_outputs(
                 sys.stdout.buffer.write(file.read())
     else:
         draw(measured, found, picture, told)
+    if arguments.report == STANDARD_OUTPUT:
+        sys.stdout.write(page(measured, found, told).html())
+    elif arguments.report is not None:
+        page(measured, found, told).write(arguments.report)
     told["seconds"] = time.perf_counter() - started
     if arguments.json is not None:
         text = json.dumps(told, indent=2) + "\n"
@@ -187,7 +196,7 @@ def _write_outputs(
             sys.stdout.write(text)
         else:
             write_atomically(arguments.json, lambda path: _write_text(path, text))
-    piped = STANDARD_OUTPUT in (picture, arguments.json)
+    piped = STANDARD_OUTPUT in (picture, arguments.json, arguments.report)
     where = None if picture == STANDARD_OUTPUT else picture
     printed = lines(told, where, example=not arguments.files)
     print("\n".join(printed + _compared(told)), file=sys.stderr if piped else sys.stdout)

@@ -131,22 +131,45 @@ def equation(measured: Measurement, found: Estimate) -> str:
     return " ".join(parts).replace("- -", "+ ")
 
 
+Fact = tuple[str, str]  # what, and in words what it is
+
+
 def lines(told: dict[str, Any], picture: str | None, example: bool) -> list[str]:
     """The result as lines of text."""
-    text = [_heading(told)]
-    text += [f"  {'used':<24} {_used(told)}"]
+    numbers = []
+    for name, value, error, unit in fitted_numbers(told):
+        note = f"   (true {EXAMPLE[name]:g})" if example and name in ("ks", "kd") else ""
+        numbers.append(_line(name, value, error, unit, note))
+    after = [*derived(told), ("time", f"{told['seconds']:.1f} s in all")]
+    if picture is not None:
+        after.append(("picture", picture))
+    after += [("WARNING", warning) for warning in told["warnings"]]
+    return [heading(told), *map(_fact_line, used(told)), *numbers, *map(_fact_line, after)]
+
+
+def _fact_line(fact: Fact) -> str:
+    name, words = fact
+    return f"  {name:<24} {words}"
+
+
+def used(told: dict[str, Any]) -> list[Fact]:
+    """What of the recording was used, and what was left out."""
+    facts = [("used", _used(told))]
     if told["left_out"]:
         out = [f"{entry['column']} ({entry['reason']})" for entry in told["left_out"]]
-        text.append(f"  {'left out':<24} {listed(out)}")
-    text += [f"  {'note':<24} {note}" for note in told["notes"]]
-    units = _units(told)
+        facts.append(("left out", listed(out)))
+    return facts + [("note", note) for note in told["notes"]]
+
+
+def fitted_numbers(told: dict[str, Any]) -> list[tuple[str, float, float | None, str]]:
+    """Name, value, standard error and unit of each number of the model."""
+    units, numbers = _units(told), []
     for spring in told["springs"]:
         where = "" if len(told["springs"]) == 1 else f" of {spring['edge']}"
         for name in ("ks", "kd"):
             if name == "kd" and "viscous" not in told["friction"]:
                 continue
-            note = f"   (true {EXAMPLE[name]:g})" if example else ""
-            text.append(_line(name + where, spring[name], spring[name + "_stderr"], units[name], note))
+            numbers.append((name + where, spring[name], spring[name + "_stderr"], units[name]))
     for key, name in (
         ("drag_coefficient", "drag coefficient"),
         ("dry_friction", "dry friction"),
@@ -155,31 +178,33 @@ def lines(told: dict[str, Any], picture: str | None, example: bool) -> list[str]
         ("gain", "gain of the input"),
     ):
         if key in told:
-            text.append(_line(name, told[key], told[key + "_stderr"], units[key]))
+            numbers.append((name, told[key], told[key + "_stderr"], units[key]))
+    return numbers
+
+
+def derived(told: dict[str, Any]) -> list[Fact]:
+    """What follows from the numbers, and how far they are to be trusted."""
+    facts = []
     if "pendulum_length" in told:
-        text.append(f"  {'length':<24} {told['pendulum_length']:.4g} m, of a point mass at g = {G} m/s^2")
+        facts.append(("length", f"{told['pendulum_length']:.4g} m, of a point mass at g = {G} m/s^2"))
     for mode in told["modes"]:
         omega = mode["natural_frequency"]
         hertz = omega / (2 * np.pi)
-        text.append(f"  {'natural frequency':<24} {omega:.5g} rad/s = {hertz:.4g} Hz (squared {omega**2:.4g} 1/s^2)")
-        text.append(f"  {'damping ratio':<24} {mode['damping_ratio'] + 0.0:.4g}")
+        facts.append(("natural frequency", f"{omega:.5g} rad/s = {hertz:.4g} Hz (squared {omega**2:.4g} 1/s^2)"))
+        facts.append(("damping ratio", f"{mode['damping_ratio'] + 0.0:.4g}"))
     if told["equation"]:
-        text.append(f"  {'equation':<24} {told['equation']}")
+        facts.append(("equation", told["equation"]))
     unit = told["unit"]
     share = f"{100 * told['share_of_amplitude']:.2g} % of the amplitude {told['amplitude']:.3g} {unit}"
-    text.append(f"  {'residual RMS':<24} {told['rms']:.3g} {unit}, {share}")
+    facts.append(("residual RMS", f"{told['rms']:.3g} {unit}, {share}"))
     if told["stderr_widened_by"] > 1.05:
-        text.append(f"  {'errors':<24} widened {told['stderr_widened_by']:.2g} times, as the residual is correlated")
-    text.append(f"  {'trust':<24} {_trust(told)}")
-    text.append(f"  {'fit':<24} {told['message']}, {told['iterations']} iterations")
-    text.append(f"  {'time':<24} {told['seconds']:.1f} s in all")
-    if picture is not None:
-        text.append(f"  {'picture':<24} {picture}")
-    text += [f"  {'WARNING':<24} {warning}" for warning in told["warnings"]]
-    return text
+        facts.append(("errors", f"widened {told['stderr_widened_by']:.2g} times, as the residual is correlated"))
+    facts.append(("trust", _trust(told)))
+    facts.append(("fit", f"{told['message']}, {told['iterations']} iterations"))
+    return facts
 
 
-def _heading(told: dict[str, Any]) -> str:
+def heading(told: dict[str, Any]) -> str:
     masses = ", ".join(f"{m:.4g}" for m in told["mass"])
     run = f", run {told['run']}" if told["run"] else ""
     inertia = "inertia" if told["quantity"].startswith("ang") else "mass"

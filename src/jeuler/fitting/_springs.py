@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -10,9 +11,11 @@ from jax import Array
 
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
+from jeuler.fitting.beside import attach, attached
 from jeuler.fitting.options import Options
+from jeuler.fitting.pages import RECORDING, page_of
 from jeuler.fitting.parameters import values_of_springs
-from jeuler.fitting.profiles import again_of, keep
+from jeuler.fitting.profiles import AGAIN
 from jeuler.fitting.recorded import Recorded
 from jeuler.fitting.result import Fit, as_pytree
 from jeuler.particles.scene import Scene
@@ -63,6 +66,30 @@ class SpringFit(Fit):
     predicted: Array
     step_bias: Any = None
     start: str = "given"
+
+    def report(self, path: str | os.PathLike[str]) -> None:
+        """Write the fit as one HTML file, which a browser opens without a network.
+
+        It shows data over prediction, the residual with its autocorrelation and spectrum, each parameter with its
+        95 % interval, the correlation of their errors, the net coloured by ks and kd, the loss, what the data do not
+        determine, and what to do next. What stood at the path is replaced when the page is whole.
+
+        Args:
+          path: where it goes.
+        Raises: ValueError, if the fit was copied, or made under jit or vmap: it does not have its data then.
+        Example:
+          >>> import os, tempfile, jax.numpy as jnp, numpy as np, jeuler
+          >>> weight = jeuler.ParticleState([[0.0], [1.2]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
+          >>> scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks=25.0, kd=0.0, rest_length=1.0),))
+          >>> times = np.linspace(0.0, 2.0, 41)
+          >>> positions = np.stack([0 * times, 1 + 0.2 * np.cos(np.sqrt(30.0) * times)], 1)[..., None]
+          >>> found = jeuler.fit_springs(scene, weight, times, positions, dt=0.01, parameters=("ks",))
+          >>> with tempfile.TemporaryDirectory() as folder:
+          ...     found.report(os.path.join(folder, "fit.html"))
+          ...     os.listdir(folder)
+          ['fit.html']
+        """
+        page_of(self).write(path)
 
 
 as_pytree(SpringFit, ("message", "undetermined", "blind", "at_bound", "start"))
@@ -179,5 +206,6 @@ def fit_springs(
         start=begun,
         **fields,
     )
-    keep(complete, again_of(found.fit))
+    attach(complete, AGAIN, attached(found.fit, AGAIN))
+    attach(complete, RECORDING, task)
     return complete

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jeuler.fitting.beside import attach
 from jeuler.fitting.descent import by_optax
 from jeuler.fitting.kept import Record
 from jeuler.fitting.least_squares import State, Task
@@ -13,7 +14,7 @@ from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import TUNING, Watch, progress_bar, search
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import Problem, programs
-from jeuler.fitting.profiles import Again, keep
+from jeuler.fitting.profiles import AGAIN, Again
 from jeuler.fitting.report import NOT_FINITE, ending, report
 from jeuler.fitting.result import Fit
 from jeuler.fitting.starts import best_start
@@ -70,7 +71,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
     fit = report(problem, state, found.history, found.spread, options.loss, words, known, starts)
     if fit.stderr is not None:
         task = task._replace(spread=np.asarray(found.spread))
-        keep(fit, _again(problem, evaluate, options.loss, task, state, fit))
+        attach(fit, AGAIN, _again(problem, evaluate, options.loss, task, state, fit))
     return Outcome(fit, state)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import weakref
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 
 MOST_TRIES = 20
 NEAR = 0.01  # of a standard error
+AGAIN = "search again"  # under this name an `Again` is kept beside a result
 
 
 class Profile(NamedTuple):
@@ -41,7 +41,7 @@ class Profile(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Again:
-    """What a fit needs to search once more with one parameter held: kept beside a result, not copied with it."""
+    """What a fit needs to search once more with one parameter held: kept beside a result (`jeuler.fitting.beside`)."""
 
     layout: Layout
     evaluate: Evaluate
@@ -104,18 +104,3 @@ class Again:
         rise = max(float(state.cost - self.state.cost), 0.0)
         wider = float(self.error[k] / self.white[k]) if self.white[k] > 0 else 1.0
         return state, float(np.sqrt(rise / self.variance)) / wider
-
-
-_KEPT: dict[int, Again] = {}  # by the id of a result, as long as it lives; copies have none
-
-
-def keep(found: Any, again: Again | None) -> None:
-    """Remember what a further search from this result needs."""
-    if again is not None:
-        _KEPT[id(found)] = again
-        weakref.finalize(found, _KEPT.pop, id(found), None)
-
-
-def again_of(found: Any) -> Again | None:
-    """What a further search from this result needs; None if it is a copy."""
-    return _KEPT.get(id(found))

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 
 from jeuler._core.component import result
-from jeuler.fitting import profiles
 from jeuler.fitting._tables import fit_table
-from jeuler.fitting.profiles import Profile
+from jeuler.fitting.beside import attached
+from jeuler.fitting.profiles import AGAIN, Profile
 
 PyTree = Any
 
@@ -92,7 +92,7 @@ class Fit:
 
         if not 0 < level < 1:
             raise ValueError(f"level must lie between 0 and 1, got {level!r}")
-        again = profiles.again_of(self)
+        again = attached(self, AGAIN)
         if again is None:
             raise ValueError("a profile needs the fit as `fit` gave it, with standard errors; fit again")
         return again.profile(name, float(norm.ppf((1 + level) / 2)))

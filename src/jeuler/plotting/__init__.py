@@ -5,6 +5,7 @@ from jeuler.plotting.camera import Camera
 from jeuler.plotting.film import animate
 from jeuler.plotting.fits import plot_fit
 from jeuler.plotting.render import Look, draw
+from jeuler.plotting.residuals import plot_correlation, plot_history, plot_net, plot_residual
 from jeuler.plotting.teaching import (
     error_against_dt,
     euler_polygon,
@@ -22,7 +23,11 @@ __all__ = [
     "error_against_dt",
     "euler_polygon",
     "local_and_cumulative_error",
+    "plot_correlation",
     "plot_fit",
+    "plot_history",
+    "plot_net",
+    "plot_residual",
     "plot_work_precision",
     "slope_field",
     "stability_regions",
