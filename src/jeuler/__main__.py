@@ -8,7 +8,22 @@ STARTED = time.perf_counter()
 
 import argparse  # noqa: E402
 import sys  # noqa: E402
-from typing import NoReturn  # noqa: E402
+from typing import Any, NoReturn  # noqa: E402
+
+
+class Once(argparse.Action):
+    """The value of an option, given once and not empty. Files, which are no option, are as many as there are."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        if option_string:
+            given = namespace.__dict__.setdefault("given", set())
+            if self.dest in given:
+                parser.error(f"{option_string} must be given once, got two; leave one out")
+            if not isinstance(values, (int, float)) and (not isinstance(values, str) or not values.strip()):
+                parser.error(f"{option_string} must have a value, got none; leave it out for what it is without it")
+            given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
 
 EPILOG = """examples:
   python -m jeuler fit                                  a built-in example
@@ -22,7 +37,11 @@ OBSERVED = ("position", "angle", "acceleration", "velocity", "angular velocity")
 
 
 class Parser(argparse.ArgumentParser):
-    """Bad usage is one line and exit code 2."""
+    """Bad usage is one line and exit code 2. Options are written in full, and once."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**how, allow_abbrev=False)
+        self.register("action", None, Once)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message}\n")

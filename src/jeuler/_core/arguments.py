@@ -87,5 +87,8 @@ def _meant(key: str, names: tuple[str, ...], instead: dict[str, str]) -> str:
 
 def near_name(name: str, names: Any, cutoff: float = 0.65) -> str | None:
     """The one of the names that a person who wrote ``name`` is likely to have meant."""
+    for other in names:
+        if sorted(name) == sorted(other):  # letters swapped, which in short names are much of the name
+            return other
     found = difflib.get_close_matches(name, list(names), n=1, cutoff=cutoff)
     return found[0] if found else None

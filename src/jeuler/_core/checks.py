@@ -52,6 +52,21 @@ def number(name: str, x: Any) -> None:
         raise ValueError(f"{expected}, got {x!r}")
 
 
+def reals(name: str, x: Any, meaning: str, dtype: Any = float) -> Any:
+    """x as an array of real numbers; traced ones as they are."""
+    if is_traced(x):
+        return x
+    try:
+        array = np.asarray(x)
+        if array.dtype.kind not in "iufO" and not jnp.issubdtype(array.dtype, jnp.floating):
+            raise TypeError
+        if array.dtype == object and any(isinstance(each, (str, bytes, bool)) for each in array.flat):
+            raise TypeError
+        return array.astype(dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be {meaning}, got {shown(x)}") from None
+
+
 def positive(name: str, x: Any, unit: str = "") -> None:
     """x is a finite real scalar above zero."""
     number(name, x)

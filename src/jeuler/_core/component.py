@@ -99,7 +99,7 @@ def as_float(x: ArrayLike | None) -> Array | None:
 
 def store_as_float(component: Any, *names: str) -> None:
     """For ``__post_init__``: replace the named fields by floating arrays. None stays where it is the default."""
-    required = {field.name for field in dataclasses.fields(component) if field.default is dataclasses.MISSING}
+    required = {field.name for field in dataclasses.fields(component) if field.default is not None}
     for name in names:
         value = getattr(component, name)
         try:

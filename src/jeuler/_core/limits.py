@@ -32,10 +32,26 @@ def check_limits(component: Any) -> None:
         checks.finite(where, value, infinite=name in infinite)
 
 
+def check_axes(component: Any) -> None:
+    """One ValueError if a parameter has more axes than its class declares, ``axes = {"velocity": 1, "period": 0}``.
+
+    For use in a run, where an array for each member of a batch has lost the axis of the batch.
+    """
+    for name, most in getattr(type(component), "axes", {}).items():
+        value = getattr(component, name)
+        if not callable(value) and jnp.ndim(value) > most:
+            expected = "have shape (dim,)" if most else "be one number"
+            raise ValueError(
+                f"{type(component).__name__}.{name} must {expected}, got shape {jnp.shape(value)}; "
+                f"for a batch of scenes use jax.vmap"
+            )
+
+
 def check_parameters(name: str, x: Any) -> None:
     """One ValueError if a number anywhere in a tree of components is NaN, or out of the limits of its class."""
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         check_limits(x)
+        check_axes(x)
         for field in dataclasses.fields(x):
             check_parameters(f"{name}.{field.name}", getattr(x, field.name))
     elif isinstance(x, (tuple, list)):

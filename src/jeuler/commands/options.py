@@ -95,6 +95,8 @@ def start(text: str | None) -> dict[str, float]:
         value = _floats("--start", found.group(2))[0] if found else -1.0
         if not found or not 0 < value < 1e15:
             raise ValueError(f"--start must be like ks=20,kd=0.3 with positive numbers, got {part.strip()!r}")
+        if found.group(1) in start:
+            raise ValueError(f"--start must name {found.group(1)} once, got {text!r}")
         start[found.group(1)] = value
     return start
 

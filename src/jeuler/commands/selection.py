@@ -71,6 +71,8 @@ def _units(text: str | None, names: list[str]) -> dict[str, str]:
                 f"--unit must be like x=mm,t=ms with names of columns, got {part.strip()!r}; "
                 f"the columns are {listed(names)}"
             )
+        if found in units:
+            raise ValueError(f"--unit must name each column once, got {found!r} twice in {text!r}")
         units[found] = unit.strip()
     return units
 

@@ -42,7 +42,7 @@ class _Shape:
                 object.__setattr__(self, name, as_component(value))
             elif name == "inside":
                 checks.true_or_false(f"{type(self).__name__}.inside", value)
-            elif not isinstance(value, bool):
+            else:
                 store_as_float(self, name)
 
     @property

@@ -82,6 +82,8 @@ class Collisions:
             value = getattr(self, name)
             if not checks.is_traced(value) and not bool(jnp.all((value >= 0) & (value <= most))):
                 raise ValueError(f"Collisions.{name} must be from 0 to {most}, got {checks.shown(value.tolist())}")
+        for name in ("radius", "friction"):
+            checks.finite(f"Collisions.{name}", getattr(self, name))
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:

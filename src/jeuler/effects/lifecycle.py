@@ -395,6 +395,7 @@ class DeathOnContact:
     margin: Parameter = default(0.0)
 
     acts = BEFORE
+    limits: ClassVar[Limits] = {"margin": ("", "m")}
     needs: ClassVar[tuple[str, ...]] = ("forward time",)
     writes: ClassVar[tuple[str, ...]] = ("alive",)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.fitting.blind import describe_blind
 from jeuler.fitting.evaluate import residual_and_jacobian
@@ -56,6 +57,7 @@ class Identifiability:
     message: str
 
 
+@says_what_to_write(dts="dt=...", noise="sigma=...", positions="times, when positions will be measured")
 def identifiability(
     scene: Scene,
     state: ParticleState,
@@ -106,7 +108,7 @@ def identifiability(
         raise ValueError(
             f"observed must be booleans of shape {shape[:1]}, one a particle, got {seen.dtype}{seen.shape}"
         )
-    times = np.asarray(times, float)
+    times = checks.reals("times", times, "numbers of shape (time,), s")
     targets = np.where(seen[:, None], np.zeros((times.size, *shape)), np.nan)
     task = Recorded.of(
         scene,

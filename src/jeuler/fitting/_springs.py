@@ -9,6 +9,7 @@ from typing import Any
 
 from jax import Array
 
+from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.fitting.beside import attach, attached
@@ -189,6 +190,8 @@ def fit_springs(
         resume=resume,
         progress=progress,
     )
+    checks.true_or_false("grow", grow)
+    checks.true_or_false("step_bias", step_bias)
     if start not in ("data", "given"):
         raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
     task = Recorded.of(

@@ -11,8 +11,8 @@ from jeuler._core import checks
 
 def checked_observations(times: Any, positions: Any, shape: tuple[int, ...], t0: float) -> tuple[np.ndarray, Any]:
     """Times and targets as float64 NumPy arrays, checked."""
-    times = np.asarray(times, float)
-    targets: Any = positions if checks.is_traced(positions) else np.asarray(positions, float)
+    times = checks.reals("times", times, "numbers of shape (time,), s")
+    targets: Any = checks.reals("positions", positions, "numbers of shape (time, particle, dim), m")
     if times.ndim != 1 or not len(times):
         raise ValueError(f"times must have shape (time,) with at least one time, got {times.shape}")
     if targets.shape != (len(times), *shape):

@@ -147,6 +147,8 @@ class Problem:
         with_data = data is not None
         if with_data:
             residual, data = arrays_only(residual, data)
+        if not layout.size:
+            raise ValueError(f"params must hold at least one floating number, got {checks.shown(params)}")
         form, closes_over_traced = residual_layout(residual, params, data, with_data)
         if not form.size or not layout.size:
             raise ValueError(

@@ -70,6 +70,8 @@ class Wind:
 
     velocity: MovingParameter
 
+    axes: ClassVar[dict[str, int]] = {"velocity": 1}
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "velocity", moving("Wind.velocity", self.velocity))
 
@@ -99,6 +101,7 @@ class Gust:
     period: Parameter
 
     limits: ClassVar[dict[str, Any]] = {"velocity": ("", "m/s"), "period": ("> 0", "s")}
+    axes: ClassVar[dict[str, int]] = {"velocity": 1, "period": 0}
 
     def __post_init__(self) -> None:
         store_as_float(self, "velocity", "period")
@@ -144,6 +147,7 @@ class Turbulence:
 
     limits: ClassVar[dict[str, Any]] = {"speed": (">= 0", "m/s"), "size": ("> 0", "m"), "time": ("> 0", "s")}
     may_be_infinite: ClassVar = ("time",)
+    axes: ClassVar[dict[str, int]] = {"speed": 0, "size": 0, "time": 0}
 
     def __post_init__(self) -> None:
         store_as_float(self, "speed", "size", "time", "waves", "amplitudes", "phases", "frequencies")
@@ -178,7 +182,7 @@ def turbulence(
 
     Source: R. H. Kraichnan, Diffusion by a Random Velocity Field, Phys. Fluids 13, 1970 (a sum of random waves).
     """
-    if dim not in (2, 3):
+    if checks.count("turbulence.dim", dim) not in (2, 3):
         raise ValueError(f"turbulence.dim must be 2 or 3, got {checks.shown(dim)}")
     modes, seed = checks.count("turbulence.modes", modes, least=1), checks.count("turbulence.seed", seed)
     random = np.random.default_rng(seed)
@@ -220,6 +224,7 @@ class Vortex:
     axis: Parameter = default((0.0, 0.0, 1.0))
 
     limits: ClassVar[dict[str, Any]] = {"circulation": ("", "m^2/s"), "core": ("> 0", "m"), "axis": ("", "")}
+    axes: ClassVar[dict[str, int]] = {"center": 1, "circulation": 0, "core": 0, "axis": 1}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving("Vortex.center", self.center))

@@ -48,6 +48,7 @@ class PointAttractor:
     power: float = 2
 
     limits: ClassVar[dict[str, Any]] = {"center": ("", "m"), "strength": ("", ""), "softening": ("> 0", "m")}
+    axes: ClassVar[dict[str, int]] = {"center": 1, "strength": 0, "softening": 0}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", moving("PointAttractor.center", self.center))

@@ -15,12 +15,14 @@ from jax import Array, lax
 
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import component, store_as_float
 from jeuler._core.indices import Indices
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
 
 
+@says_what_to_write()
 def strand_edges(strands: Any) -> np.ndarray:
     """The pairs of neighbours along strands: (strand, node) indices to (spring, 2), for `Springs`.
 
@@ -96,6 +98,7 @@ class _OnStrands:
     strands: Any
     rest_position: Array
 
+    axes: ClassVar[dict[str, int]] = {"stiffness": 0, "damping": 0, "smoothing": 0}
     limits: ClassVar[dict[str, Any]] = {
         "rest_position": ("", "m"),
         "stiffness": (">= 0", "N/m"),

@@ -110,6 +110,7 @@ class ShapeMatching:
         "stiffness": (">= 0", "N/m"),
         "damping": (">= 0", "N s/m"),
     }
+    axes: ClassVar[dict[str, int]] = {"stiffness": 0, "damping": 0}
 
     def __post_init__(self) -> None:
         given = list(self.particles) if isinstance(self.particles, range) else self.particles

@@ -84,9 +84,10 @@ def simulate(
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
     check_progress(progress, checkpoint)
+    check_kinds(scene, state)
+    check_parameters("scene", scene)
     grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint, many=can_be_in_chunks(checkpoint))
     checks.true_or_false("compensated", compensated)
-    check_parameters("scene", scene)
     inputs = scene, state, grid, key, Function(step), Function(save)
     if not isinstance(windows, (str, tuple, list)):
         came = checks.shown(windows)
@@ -150,7 +151,7 @@ def check_run(
     checkpoint: Checkpoint = None,
     many: bool = False,
 ) -> Grid:
-    """Every check that looks at values, of these arguments of `simulate`: made at each call, traced or not."""
+    """Every check that looks at values, of these arguments of `simulate` but for parameters of the scene."""
     check_kinds(scene, state)
     checks.random_key(key)
     state.check()

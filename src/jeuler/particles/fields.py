@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Literal, TypeVar
 
 from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import unwrapped
 from jeuler.particles.state import ParticleState, with_default_fields
 
@@ -16,6 +17,7 @@ Acts = Literal["before motion", "after motion", "start and after motion"]
 Need = Literal["key", "clock", "forward time", "prescribed pinned"]
 
 
+@says_what_to_write()
 def uses(
     *,
     reads: tuple[str, ...] = (),

@@ -216,7 +216,9 @@ def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -
     if not jnp.issubdtype(kind, jnp.floating):
         raise ValueError(f"dtype must be floating, got {kind}; write jnp.float32 or None")
     zeros = jnp.zeros((capacity, dim), dtype or float)
-    return ParticleState(zeros, zeros, mass=mass, alive=jnp.zeros(capacity, bool))
+    pool = ParticleState(zeros, zeros, mass=mass, alive=jnp.zeros(capacity, bool))
+    pool.check()
+    return pool
 
 
 def with_default_fields(

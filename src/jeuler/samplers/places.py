@@ -38,6 +38,8 @@ class FromLine(Sampler):
     start: Parameter
     end: Parameter
 
+    axes: ClassVar[dict[str, int]] = {"start": 1, "end": 1}
+
     def __post_init__(self) -> None:
         store_as_float(self, "start", "end")
         check_points("FromLine", start=self.start, end=self.end)
@@ -75,6 +77,7 @@ class FromDisc(Sampler):
     normal: Parameter = default((0.0, 0.0, 1.0))
 
     limits: ClassVar[dict[str, Any]] = {"center": ("", "m"), "radius": (">= 0", "m"), "normal": ("", "")}
+    axes: ClassVar[dict[str, int]] = {"center": 1, "radius": 0, "normal": 1}
 
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius", "normal")
@@ -120,6 +123,7 @@ class FromSphere(Sampler):
     surface: bool = False
 
     limits: ClassVar[dict[str, Any]] = {"center": ("", "m"), "radius": (">= 0", "m")}
+    axes: ClassVar[dict[str, int]] = {"center": 1, "radius": 0}
 
     def __post_init__(self) -> None:
         store_as_float(self, "center", "radius")
@@ -210,7 +214,8 @@ class Cone(Sampler):
     speed: SampledParameter
     angle: Parameter = default(0.0)
 
-    limits: ClassVar[dict[str, Any]] = {"direction": ("", ""), "angle": (">= 0", "rad")}
+    limits: ClassVar[dict[str, Any]] = {"direction": ("", ""), "speed": (">= 0", "m/s"), "angle": (">= 0", "rad")}
+    axes: ClassVar[dict[str, int]] = {"direction": 1, "speed": 0, "angle": 0}
 
     def __post_init__(self) -> None:
         store_as_float(self, "direction", "angle")

@@ -115,7 +115,12 @@ def solve_adaptive(
         checks.number(name, tolerance)
         if not checks.is_traced(tolerance) and float(tolerance) < 0:
             raise ValueError(f"{name} must be at least 0, got {tolerance!r}")
-    times = jnp.atleast_1d(jnp.asarray(t1, trees.time_dtype(y0)))
+    dtype = trees.time_dtype(y0)
+    times = jnp.atleast_1d(jnp.asarray(checks.reals("t1", t1, "a time, or increasing times, s", dtype), dtype))
+    if times.ndim > 1 or not times.size:
+        raise ValueError(f"t1 must be a time, or times of shape (time,), s, got shape {times.shape}")
+    if not checks.is_traced(times):
+        checks.finite("t1", times if times.size > 1 else times[0])
     t0 = jnp.asarray(t0, times.dtype)
     if not checks.is_traced(times) and not checks.is_traced(t0) and not _in_order(t0, times):
         raise ValueError(

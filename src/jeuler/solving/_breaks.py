@@ -19,15 +19,13 @@ SIDE = 8  # units in the last place that "just before" and "just after" a break 
 
 def checked_breaks(breaks: Any, dtype: Any) -> Array:
     """The breaks as one sorted array, or one ValueError."""
-    try:
-        array = jnp.atleast_1d(jnp.asarray(breaks, dtype))
-    except (TypeError, ValueError):
-        raise ValueError(f"breaks must be times, s, got {breaks!r}") from None
-    if array.ndim > 1:
-        raise ValueError(f"breaks must be times of shape (break,), s, got shape {array.shape}")
-    if not checks.is_traced(array) and not np.all(np.isfinite(array)):
+    traced = any(map(checks.is_traced, jax.tree.leaves(breaks)))  # in a list too
+    given = jnp.asarray(breaks, dtype) if traced else checks.reals("breaks", breaks, "times, s", dtype)
+    if given.ndim > 1:
+        raise ValueError(f"breaks must be times of shape (break,), s, got shape {given.shape}")
+    if not traced and not np.all(np.isfinite(given)):
         raise ValueError(f"breaks must be finite times, s, got {breaks!r}")
-    return jnp.sort(array)
+    return jnp.sort(jnp.atleast_1d(jnp.asarray(given)))
 
 
 def margin(breaks: Array) -> Array:

@@ -138,6 +138,8 @@ def stability_limit(
     elif y is None:
         raise ValueError("y must be the state at time t, got None; call stability_limit(f, t, y, args)")
     checks.untraced("stability_limit", t, y, args)
+    checks.refuse_class("step must be a function (f, t, y, dt, args) -> y", step)
+    checks.function("step", step, "(f, t, y, dt, args) -> y", "pass, say, jeuler.euler_step")
     checks.number("t", t)
     y = checks.state("y", y)
     checks.field_form(f)

@@ -52,6 +52,10 @@ def describe(table: Table, units: dict[str, str]) -> list[Column]:
             raise ValueError(
                 f"--unit: the unit {unit!r} of {name!r} is not known; known are s, ms, m, mm, m/s^2, rad, ..."
             )
+        if by_name == "time" and by_unit and by_unit[0] != "time" and name in units:
+            raise ValueError(
+                f"--unit: {unit!r} is a unit of {by_unit[0]}, and {name!r} is a time; write {name}=ms, say"
+            )
         quantity, factor = _quantity("" if name in units else by_name, by_unit, unit)
         if quantity == "index" and not _counts(table.values[:, k]):
             quantity = ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from jeuler._core import checks
 from jeuler.fitting.recordings import source as sources
 from jeuler.fitting.recordings.frames import is_frame, read_frame, read_matlab, read_workbook
 from jeuler.fitting.recordings.table import Table
@@ -12,6 +13,7 @@ from jeuler.fitting.recordings.text import read_text
 
 def read_table(source: Any, skip: int = 0) -> Table:
     """The table in a path, an open file or a frame; ``skip``: how many lines at the top of a text to leave out."""
+    skip = checks.count("skip", skip)
     if is_frame(source):
         return read_frame(source)
     name, raw = sources.content(source)
