@@ -63,7 +63,7 @@ def check_counter(num_steps: int, save_every: int, many: bool = False) -> None:
     if not many and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         raise ValueError(
             f"num_steps must be at most {COUNTER:,} under jit, vmap and grad where integers have 32 bits, got "
-            f'{num_steps:,}; write jax.config.update("jax_enable_x64", True), or call it outside of these'
+            f"{num_steps:,}; call it outside of these, or turn on 64-bit numbers"
         )
     if max(save_every, num_steps // save_every) > COUNTER:
         raise ValueError(
