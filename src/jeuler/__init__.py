@@ -5,24 +5,15 @@ The verbs stand here: `solve`, `simulate`, `fit`, `fit_springs`, `advise_step`, 
 `jeuler.contact`, `jeuler.samplers`, `jeuler.steps`; figures are in `jeuler.plotting`, scenes in `jeuler.scenes`.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from jeuler import contact as contact
 from jeuler import effects as effects
 from jeuler import forces as forces
 from jeuler import samplers as samplers
 from jeuler import steps as steps
-from jeuler.accuracy import (
-    Compensated,
-    Method,
-    MethodAdvice,
-    RankedMethod,
-    StepAdvice,
-    WorkPrecision,
-    advise_method,
-    advise_step,
-    work_precision,
-)
 from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
-from jeuler.diagnosis import Diagnosis, diagnose
 from jeuler.effects import (
     Death,
     DeathOnContact,
@@ -33,16 +24,6 @@ from jeuler.effects import (
     PrescribedMotion,
     SampledPath,
     SpeedLimit,
-)
-from jeuler.fitting import (
-    Fit,
-    Identifiability,
-    SpringFit,
-    Trajectory,
-    fit,
-    fit_springs,
-    identifiability,
-    read_trajectory,
 )
 from jeuler.forces import (
     Bending,
@@ -79,6 +60,30 @@ from jeuler.steps import (
     stability_limit,
     symplectic_euler_step,
 )
+
+if TYPE_CHECKING:
+    from jeuler.accuracy import (
+        Compensated,
+        Method,
+        MethodAdvice,
+        RankedMethod,
+        StepAdvice,
+        WorkPrecision,
+        advise_method,
+        advise_step,
+        work_precision,
+    )
+    from jeuler.diagnosis import Diagnosis, diagnose
+    from jeuler.fitting import (
+        Fit,
+        Identifiability,
+        SpringFit,
+        Trajectory,
+        fit,
+        fit_springs,
+        identifiability,
+        read_trajectory,
+    )
 
 __version__ = "0.1.0"
 
@@ -162,3 +167,41 @@ __all__ = [
     "uses",
     "work_precision",
 ]
+
+_ON_DEMAND = {  # packages that are imported at the first use of a name of theirs: half of the time of an import
+    "accuracy": (
+        "Compensated",
+        "Method",
+        "MethodAdvice",
+        "RankedMethod",
+        "StepAdvice",
+        "WorkPrecision",
+        "advise_method",
+        "advise_step",
+        "work_precision",
+    ),
+    "diagnosis": ("Diagnosis", "diagnose"),
+    "fitting": (
+        "Fit",
+        "Identifiability",
+        "SpringFit",
+        "Trajectory",
+        "fit",
+        "fit_springs",
+        "identifiability",
+        "read_trajectory",
+    ),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for package, names in _ON_DEMAND.items():
+        if name == package or name in names:
+            module = importlib.import_module(f"jeuler.{package}")
+            globals().update({each: getattr(module, each) for each in names})
+            return module if name == package else getattr(module, name)
+    raise AttributeError(f"module 'jeuler' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_ON_DEMAND, *__all__})

@@ -67,6 +67,7 @@ def parser() -> Parser:
     add("--json", metavar="OUT.json", help="write the result as JSON too; - is standard output")
     add("--report", metavar="OUT.html", help="write the fit as one HTML page too, which needs no network")
     add("--max-iterations", type=int, default=200, help="the most iterations of each stage of the fit (default 200)")
+    add("--no-cache", action="store_true", help="keep no compiled programs in the user's cache folder, use none")
     look = jobs.add_parser(
         "look",
         help="say what is understood of a recording, and the fit command that it suggests",
@@ -111,6 +112,10 @@ def main(argv: list[str] | None = None) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    if argv is None and arguments.job == "fit" and not arguments.no_cache:
+        from jeuler.commands.program_cache import keep_programs
+
+        keep_programs()
     from jeuler.commands.fit_file import fit_file
     from jeuler.commands.look_file import look_file
 

@@ -1,0 +1,108 @@
+"""How long a first answer takes: whole processes, from an empty and from a warm compilation cache.
+
+    python benchmarks/first_answer.py             a table; about ten minutes on two cores
+    python benchmarks/first_answer.py solve fit   these rows alone
+
+Each figure is of processes of their own, medians of `ROUNDS`: seconds by the clock, seconds of CPU, programs compiled.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+ROUNDS = 3
+COUNTED = """
+import atexit, sys, jax
+programs = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, seconds, **_: programs.append(name) if name == "/jax/core/compile/backend_compile_duration" else None)
+atexit.register(lambda: print("programs", len(programs), file=sys.stderr))
+"""
+FIELD = "import jax, jax.numpy as jnp\ndef f(t, y, args): return jnp.array([y[1], -y[0] - args * y[1]])\n"
+SOLVE = "print(jeuler.solve(f, jnp.array([1., 0.]), dt=0.01, num_steps=1000, save_every=1000, args=0.1).y[-1])"
+DIFFRAX = """import diffrax
+print(diffrax.diffeqsolve(diffrax.ODETerm(f), diffrax.Euler(), 0., 10., 0.01, jnp.array([1., 0.]), args=0.1).ys[-1])
+"""
+CLOTH = """
+import numpy as np, jeuler
+n = 64
+k = np.arange(n * n).reshape(n, n)
+pairs = [(k[:-1], k[1:]), (k[:, :-1], k[:, 1:]), (k[:-1, :-1], k[1:, 1:]), (k[1:, :-1], k[:-1, 1:])]
+edges = np.concatenate([np.stack([a.ravel(), b.ravel()], 1) for a, b in pairs])
+start = np.stack([*np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), np.zeros((n, n))], -1).reshape(-1, 3)
+state = jeuler.ParticleState(jnp.asarray(start, jnp.float32), jnp.zeros((n * n, 3), jnp.float32))
+def run(ks):
+    scene = jeuler.Scene((jeuler.Gravity([0., 0., -9.81]), jeuler.Springs(edges, ks, 0.1, 1.0)))
+    return jeuler.simulate(scene, state, dt=1e-3, num_steps=100, save_every=100).y.position[-1]
+"""
+DECAY = """
+import numpy as np
+times = np.arange(50) * 0.1
+data = np.exp(-0.7 * times)
+"""
+FIT = """import jeuler
+def residual(p):
+    return jeuler.solve(lambda t, y, k: -k * y, jnp.asarray(1.0), dt=0.1, num_steps=49, args=p["k"],
+                        step=jeuler.rk4_step).y - data
+print(jeuler.fit(residual, {"k": 1.0}).params)
+"""
+SCIPY = """import scipy.optimize
+from scipy.integrate import solve_ivp
+print(scipy.optimize.least_squares(
+    lambda k: solve_ivp(lambda t, y: -k * y, (0, 4.9), [1.0], t_eval=times, rtol=1e-8).y[0] - data, 1.0).x)
+"""
+ROWS = {
+    "import jax": "import jax",
+    "import jeuler": "import jeuler",
+    "solve": FIELD + "import jeuler\n" + SOLVE,
+    "solve, diffrax": FIELD + DIFFRAX,
+    "simulate": FIELD + CLOTH + "print(run(1000.)[0])",
+    "gradient": FIELD + CLOTH + "print(jax.grad(lambda ks: jnp.sum(run(ks) ** 2))(1000.))",
+    "fit": FIELD + DECAY + FIT,
+    "fit, SciPy": DECAY + SCIPY,
+    "command line": "import sys\nsys.argv = ['jeuler', 'fit', '--plot', 'out.png']\n"
+    "from jeuler.__main__ import main\nmain()",
+}
+
+
+def once(source: str, cache: str) -> tuple[float, float, int]:
+    """Seconds by the clock, seconds of CPU, and programs compiled or read, of one process."""
+    source = source if "jax" not in source and "jeuler" not in source else COUNTED + source
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", source], env=environment, cwd=cache, capture_output=True, text=True, check=False
+    )
+    seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise RuntimeError(done.stderr)
+    counts = [line.split()[1] for line in done.stderr.splitlines() if line.startswith("programs ")]
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return seconds, cpu, int(counts[0]) if counts else 0
+
+
+def row(name: str) -> str:
+    """The medians of a row, from an empty and from a warm cache."""
+    cold, warm = [], []
+    for _ in range(ROUNDS):
+        with tempfile.TemporaryDirectory() as cache:
+            cold.append(once(ROWS[name], cache))
+            warm.append(once(ROWS[name], cache))
+    cells = [f"{statistics.median(x):.2f}" for runs in (cold, warm) for x in list(zip(*runs, strict=True))[:2]]
+    return f"| {name} | {' | '.join(cells)} | {cold[0][2]} |"
+
+
+if __name__ == "__main__":
+    print("| | empty cache, s | of CPU | warm cache, s | of CPU | programs |\n|---|--:|--:|--:|--:|--:|")
+    for name in sys.argv[1:] or ROWS:
+        needs = {"solve, diffrax": "diffrax"}.get(name)
+        if needs is None or importlib.util.find_spec(needs):
+            print(row(name), flush=True)
