@@ -44,7 +44,7 @@ def settings(candidate, size):
 def brute_force(trials, reference, target, size):
     """(seconds, candidate, setting, steps) of the cheapest run of each method that meets the target."""
     best, found, scale = math.inf, [], np.linalg.norm(reference)
-    for trial in trials:
+    for trial in sorted(trials, key=lambda trial: "solve_adaptive" not in trial.candidate.name):
         for setting in settings(trial.candidate, size):
             outcome = trial.outcome(setting, reference, scale)
             if outcome.error <= target:

@@ -17,11 +17,16 @@ from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
 from jeuler.accuracy.search import AIM, FACTOR, Search
 from jeuler.particles.scene import Scene, effects_left_out
+from jeuler.solving._breaks import checked_breaks
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
 
 PILOT_WORK = 2**25  # numbers advanced in the longest pilot run
+IMPLICIT_WORK = 16  # times the work of an explicit step that of one which solves equations is taken to be
+FEW = 64  # steps: one fewer may make a difference
+LARGER = 0.9  # part of the steps at whose dt instability is to be seen if it is what sets dt:
+UNSTABLE = 4.0  # times the error that the order says
 
 
 @result
@@ -68,6 +73,7 @@ def advise_step(
     step: Step = euler_step,
     relative: bool = True,
     compensated: bool = False,
+    breaks: Any = (),
     max_pilot_steps: int | None = None,
 ) -> StepAdvice:
     """The largest dt whose error at t1 meets a target, from pilot runs; or a reason why no dt does.
@@ -77,9 +83,14 @@ def advise_step(
     Pilot runs with 16, 32, 64, ... steps are extrapolated to dt = 0 (Richardson). Their errors against that
     state give the dt, and further runs confirm it: at that dt, and at one 1 % larger, whose error must still be
     within a factor 3 of the target, so that no answer balances on the edge of instability. Where that leaves an
-    error far below the target, the reason says that stability sets dt, and how few implicit steps would do.
-    Finer targets than the pilots reach are predicted by the order of the step, where the errors have been seen
-    to follow it. Pilots run in float64 whatever the precision of y0.
+    error far below the target, the reason says why: one step fewer would miss it, or stability sets dt, and how few
+    implicit steps would do. Finer targets than the pilots reach are predicted by the order of the step, where the
+    errors have been seen to follow it. Pilots run in float64 whatever the precision of y0.
+
+    Where f jumps, pilots with 16, 32, 64, ... steps may all meet the jumps alike and agree on a wrong state. So the
+    extrapolated state must also be that of an adaptive run, and runs with 0.93, 0.79 and 0.61 of the steps must have
+    the errors that the order tells of them. Where they have not, numbers of steps 10 % apart are run one by one, and
+    the answer is the first whose own run meets the target, with runs 1.5 and 3 % beside it within a factor 3.
 
     The roundoff floor is measured on runs in float32 beside those in float64. For a y0 in float32 it was within a
     factor 3 of the floor that runs show in 36 of 37 cases (seven problems, three steps, plain and compensated) and 5 in
@@ -97,7 +108,9 @@ def advise_step(
       step: the method.
       relative: the target is relative to the norm of the state at t1 (True), or in the units of the state (False).
       compensated: advise for compensated sums.
-      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work.
+      breaks: times at which f may jump, s, t0 and t1 among them, for a run with the same `solve(..., breaks=)`.
+      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work, and a
+        sixteenth of that for steps that solve equations.
     Returns: `StepAdvice`; it refuses, ``feasible=False`` with the reason, rather than guess.
     Raises: ValueError, naming the argument, what was expected and what came.
     Example:
@@ -138,6 +151,7 @@ def advise_step(
         relative=relative,
         compensated=compensated,
         most=max_pilot_steps,
+        breaks=tuple(float(b) for b in np.asarray(checked_breaks(breaks, float)) if t0 <= float(b) <= t1),
     )
     advice = _Words(search).advice()
     return dataclasses.replace(advice, reason=advice.reason + left_out)
@@ -158,25 +172,42 @@ class _Words:
         start = 16
         while start * search.bound < search.interval and 2 * start <= search.most:
             start *= 2
-        if 2 * start > search.most:
-            return self.refusal(f"{self.needs()}, more than pilot runs of {search.most:,} can look into")
-        ladder = search.climb(start)
+        ladder = search.climb(start) if 2 * start <= search.most else None
         if ladder is not None and search.even(ladder):
             return self.answer(ladder)
-        final = search.reference()
-        if final is not None and (found := search.uneven(final)) is not None:
-            return self.uneven(final, *found)
+        known = search.reference
+        if known is not None:
+            search.look_at_stability(known.states[:-1:2], known.times[:-1:2])
+            if search.bound * search.most >= search.interval and (found := search.uneven(known.final)) is not None:
+                return self.uneven(known.final, *found)
+        return self.refusal(self.no_answer(ladder) + self.remedy())
+
+    def no_answer(self, ladder: Ladder | None) -> str:
+        """What stands in the way of an answer."""
+        search, most = self.search, f"{self.search.most:,} steps"
         if ladder is not None:
-            return self.refusal(
-                f"the error of {self.name} does not fall evenly with dt (f may jump), and no run of at most "
-                f"{search.most:,} steps was seen to meet the target; use an adaptive solver, or raise max_pilot_steps"
+            return (
+                f"the error of {self.name} does not fall evenly with dt (f may jump), and no run of at most {most} "
+                f"was seen to meet the target"
             )
+        if search.bound * search.most < 2 * search.interval:
+            return f"{self.needs()}, more than pilot runs of at most {most} can look into"
         if search.bound * search.most < 16 * search.interval:
-            return self.refusal(f"{self.needs()}; pilot runs of {search.most:,} cannot tell its error")
-        return self.refusal(
-            f"the error of {self.name} did not fall as its order says within {search.most:,} steps, so "
-            f"none can be predicted; use {self.finer_step()} or an adaptive solver, or raise max_pilot_steps"
-        )
+            return f"{self.needs()}, and no pilot run of at most {most} was seen to meet the target"
+        return f"the error of {self.name} did not fall as its order says within {most}, so none can be predicted"
+
+    def remedy(self) -> str:
+        """What meets the target instead: an adaptive run that was made."""
+        if self.search.reference is None:
+            return "; no adaptive run was seen to meet it either; raise max_pilot_steps, or take a shorter interval"
+        words = f"; use {self.search.reference.words}, whose run is known to meet the target"
+        fewer = self.search.implicit_steps(self.search.reference.final, 4096) if self.is_explicit else None
+        return words + (f", or {fewer:,} step{'s' * (fewer > 1)} of linearly_implicit_euler_step" if fewer else "")
+
+    @property
+    def is_explicit(self) -> bool:
+        step = self.search.step
+        return hasattr(getattr(step, "base", step), "increment")
 
     def answer(self, ladder: Ladder) -> StepAdvice:
         search = self.search
@@ -198,7 +229,7 @@ class _Words:
                 f"use {self.finer_step()} or an adaptive solver"
             )
         if error < target / FACTOR:
-            how = self.bound_by_stability(ladder, num_steps, target / error)
+            how = self.far_below(ladder, num_steps, target / error)
         elif seen:
             how = "confirmed by a pilot run of that dt"
         else:
@@ -221,18 +252,30 @@ class _Words:
         )
         return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
 
-    def bound_by_stability(self, ladder: Ladder, num_steps: int, better: float) -> str:
-        how = f"stability, not accuracy, sets dt: the error is {better:.2g} times smaller than asked"
-        if fewer := self.search.implicit_steps(ladder, num_steps // 2):
-            how += f"; linearly_implicit_euler_step meets the target with {fewer:,} step{'s' * (fewer > 1)}"
+    def far_below(self, ladder: Ladder, num_steps: int, better: float) -> str:
+        """Why an error is far below the target: as one step fewer misses it, or as larger dts grow or jump."""
+        search, smaller = self.search, f"the error is {better:.2g} times smaller than asked"
+        if num_steps == 1:
+            return f"one step is enough: {smaller}"
+        final: Any = ladder.best
+        fewer = min(math.floor(LARGER * num_steps), num_steps - 1)
+        growth = search.error_after(fewer, final) * better / (num_steps / fewer) ** search.order
+        if growth < UNSTABLE:  # no more than the order says, or little more
+            one_fewer = search.error_after(num_steps - 1, final)
+            if num_steps <= FEW and one_fewer > AIM:
+                return f"{smaller}, but with one step fewer it is {one_fewer:.2g} times the target"
+            return f"{smaller}; larger dts do not meet the target, or not within a factor 3 with dt 1 % larger"
+        how = f"stability, not accuracy, sets dt: {smaller}"
+        if self.is_explicit and (steps := search.implicit_steps(final, num_steps // 2)):
+            how += f"; linearly_implicit_euler_step meets the target with {steps:,} step{'s' * (steps > 1)}"
         return how
 
     def needs(self) -> str:
         bound = self.search.bound
         need = f"dt <= {bound:.3g} s, {self.search.interval / bound:.3g} steps"
         if self.search.stability < 0.5 * bound:  # an oscillation that the step makes grow
-            return f"oscillations that {self.name} makes grow ask for {need} (rk4_step damps them)"
-        return f"stability alone asks for {need} (use implicit_euler_step or linearly_implicit_euler_step)"
+            return f"oscillations that {self.name} makes grow ask for {need}"
+        return f"stability alone asks for {need}"
 
     def finer_step(self) -> str:
         return "heun_step, rk4_step" if self.search.order < 4 else "extrapolated_euler(8)"

@@ -300,7 +300,7 @@ class _Ranking:
         """The state at t1 by an adaptive run, where two tolerances agree; and by how much they do."""
         start = _size(flat(self.problem.y0))
         for candidate in (explicit_reference(), stiff_reference()):
-            trial, before, size = self.trial(candidate, np.float64), None, start or 1.0
+            trial, before, size = self.trial(candidate, np.float64), None, _unit(start)
             rtol = min(1e-6, 0.01 * self.error)
             while rtol > 1e-14:
                 final, _ = trial.final((rtol, rtol * size))
@@ -309,10 +309,10 @@ class _Ranking:
                 if before is not None:
                     apart = distance(before, final) / self.scale(final)
                     if apart <= TRUST * self.error:
-                        self.size = min(start, _size(final)) or max(start, _size(final)) or 1.0
+                        self.size = _unit(start, _size(final))
                         self.stiff = candidate.program_size > 0
                         return final, apart
-                size = min(start, _size(final)) or start
+                size = _unit(start, _size(final))
                 before, rtol = final, rtol / 30
         return None, math.nan
 
@@ -373,3 +373,8 @@ class _Ranking:
 def _size(numbers: np.ndarray) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(numbers**2))) if numbers.size else 0.0
+
+
+def _unit(*sizes: float) -> float:
+    """The smallest that is not 0; 1 if all are."""
+    return min((size for size in sizes if size > 0), default=1.0)

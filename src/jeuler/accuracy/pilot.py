@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 
 from jeuler._core.precision import cast, flat_rows, precision
+from jeuler.solving._breaks import checked_breaks, split_at
 from jeuler.solving._scan import advance_by, no_remainder
 from jeuler.steps.explicit import Step, VectorField
 
@@ -38,9 +39,13 @@ class Pilot:
         step: Step,
         dtype: Any,
         compensated: bool,
+        breaks: tuple[float, ...] = (),
     ) -> None:
         self.dtype, self.interval = dtype, t1 - t0
         advance = advance_by(step, compensated=compensated)
+        if breaks:
+            with precision(dtype):
+                advance = split_at(advance, checked_breaks(breaks, dtype))
 
         def run(y0, args, t0, dt, ends):
             def one_step(n, state):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from typing import Any
@@ -10,10 +11,11 @@ import numpy as np
 
 from jeuler._core import trees
 from jeuler._core.precision import cast, double_precision, flat, flat_rows
-from jeuler.accuracy.pilot import Ladder, Pilot, distance
+from jeuler.accuracy.pilot import SAMPLES, Ladder, Pilot, distance
 from jeuler.accuracy.roundoff import Rounding
 from jeuler.solving._adaptive import solve_adaptive
 from jeuler.steps.explicit import Step, VectorField
+from jeuler.steps.extrapolated import extrapolated_euler
 from jeuler.steps.implicit import linearly_implicit_euler_step
 from jeuler.steps.stability import Linearisation
 
@@ -31,9 +33,24 @@ EVEN = 2.5  # times the error that the order of the step tells of them
 BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
 FINER = 1.1  # from one number of steps to the next where errors are uneven
 REFERENCE_RTOL = 1e-8, 1e-11  # of adaptive runs; the second is the reference
-REFERENCE_STEPS = 65_536
+REFERENCE_STEPS, STIFF_REFERENCE_STEPS = 65_536, 8_192
+STIFF_STEP = extrapolated_euler(6, step=linearly_implicit_euler_step)
+STIFF_WORDS = "solve_adaptive with step=extrapolated_euler(6, step=linearly_implicit_euler_step)"
 NEAR_ENOUGH = 4  # an answer of up to this part of the longest pilot run is run itself, not predicted
 ROUGH = 2**18  # steps of the longest run in float32
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """States of an adaptive run that is known well enough, and how to make one like it."""
+
+    times: np.ndarray
+    states: np.ndarray
+    words: str
+
+    @property
+    def final(self) -> np.ndarray:
+        return self.states[-1]
 
 
 class Search:
@@ -49,6 +66,7 @@ class Search:
     relative: bool
     compensated: bool
     most: int
+    breaks: tuple[float, ...]
     interval: float
     order: int
     dtype: Any
@@ -70,9 +88,11 @@ class Search:
         relative: bool,
         compensated: bool,
         most: int,
+        breaks: tuple[float, ...] = (),
     ) -> None:
         self.f, self.start, self.t0, self.t1, self.args, self.step = f, y0, t0, t1, args, step
         self.error, self.relative, self.compensated, self.most = error, relative, compensated, most
+        self.breaks = breaks
         self.interval = t1 - t0
         self.order = int(getattr(step, "order", 1))
         self.dtype = np.dtype(trees.time_dtype(y0))
@@ -84,7 +104,7 @@ class Search:
         self.look_at_stability(flat(y0)[None], np.array([t0]))
 
     def runs(self, step: Step, dtype: Any, compensated: bool) -> Pilot:
-        return Pilot(self.f, self.start, self.t0, self.t1, self.args, step, dtype, compensated)
+        return Pilot(self.f, self.start, self.t0, self.t1, self.args, step, dtype, compensated, self.breaks)
 
     def scale(self, final: Any) -> float:
         """The unit of the target, in the units of the state."""
@@ -192,8 +212,8 @@ class Search:
         Where f jumps, rungs that are powers of two may all meet the jumps alike, and agree on a wrong state.
         """
         finest, error = ladder.num_steps[-1], float(ladder.errors()[-1])
-        final, known = self.reference(), 2 * TRUST * max(self.target(ladder), error)
-        if final is not None and ladder.error_of(final) > known:
+        known = 2 * TRUST * max(self.target(ladder), error)
+        if self.reference is not None and ladder.error_of(self.reference.final) > known:
             return False
         floor = 1e-12 * float(np.linalg.norm(ladder.finals[-1])) + 2 * ladder.doubt
         for part in OFF:
@@ -204,43 +224,54 @@ class Search:
         return True
 
     @functools.cached_property
-    def adaptive_finals(self) -> list[np.ndarray]:
-        """The states at t1 of adaptive runs at two tolerances; NaN where they take too many steps."""
-        finals = []
-        max_steps = min(REFERENCE_STEPS, max(256, self.most // 8))
-        with double_precision():
-            for rtol in REFERENCE_RTOL:
-                y0, args = cast(self.start, np.float64), cast(self.args, np.float64)
-                size = max(float(np.linalg.norm(flat(y0))), 1e-3)
-                run = solve_adaptive(
-                    self.f,
-                    y0,
-                    t0=self.t0,
-                    t1=self.t1,
-                    args=args,
-                    rtol=rtol,
-                    atol=rtol * size,
-                    max_steps=max_steps,
-                )
-                finals.append(flat_rows(run.y)[-1])
-        return finals
+    def reference(self) -> Reference | None:
+        """An adaptive run, explicit or else linearly implicit, if two tolerances agree well enough to judge the target.
 
-    def reference(self) -> np.ndarray | None:
-        """The state at t1 by an adaptive run, if two tolerances agree on it well enough to judge the target."""
-        loose, tight = self.adaptive_finals
-        known = distance(loose, tight) <= TRUST * self.error * self.scale(tight)
-        return tight if np.all(np.isfinite(tight)) and known else None
+        The states on its way say where the equation is stiff.
+        """
+        times = self.t0 + self.interval * np.arange(1, SAMPLES + 1) / SAMPLES
+        with double_precision():
+            y0, args = cast(self.start, np.float64), cast(self.args, np.float64)
+            size = max(float(np.linalg.norm(flat(y0))), 1e-3)
+            for step, most, words in (
+                (None, REFERENCE_STEPS, "solve_adaptive"),
+                (STIFF_STEP, STIFF_REFERENCE_STEPS, STIFF_WORDS),
+            ):
+                states = []
+                for rtol in REFERENCE_RTOL:
+                    run = solve_adaptive(
+                        self.f,
+                        y0,
+                        t0=self.t0,
+                        t1=times,
+                        args=args,
+                        step=step,
+                        rtol=rtol,
+                        atol=rtol * size,
+                        max_steps=min(most, max(256, self.most // 8)),
+                        breaks=self.breaks,
+                    )
+                    states.append(flat_rows(run.y)[1:])
+                loose, tight = (rows[-1] for rows in states)
+                known = distance(loose, tight) <= TRUST * self.error * self.scale(tight)
+                if np.all(np.isfinite(tight)) and known:
+                    return Reference(times, states[-1], words)
+        return None
 
     def uneven(self, final: np.ndarray) -> tuple[int, float] | None:
-        """The fewest steps of a fine scan whose own run meets the aim, with runs beside it near the target."""
+        """The fewest steps of a fine scan whose own run meets the aim, with runs beside it near the target.
+
+        It begins at a quarter of the steps that stability asks for.
+        """
         target = self.error * self.scale(final)
-        aim, num_steps, spent = AIM * target, 1, 0
+        aim, spent = AIM * target, 0
+        num_steps = max(1, math.floor(self.interval / self.bound / 4))
 
         def error_of(num_steps: int) -> float:
             error = distance(self.pilot(num_steps)[-1], final)
             return error if math.isfinite(error) else math.inf
 
-        while num_steps <= self.most and spent <= 2 * self.most:
+        while num_steps <= self.most and spent <= 4 * self.most:
             spent += num_steps
             error = error_of(num_steps)
             beside = [round(num_steps * part) for part in BESIDE]
@@ -249,12 +280,17 @@ class Search:
             num_steps = max(num_steps + 1, round(FINER * num_steps))
         return None
 
-    def implicit_steps(self, ladder: Ladder, fewer_than: int) -> int | None:
+    def error_after(self, num_steps: int, final: np.ndarray) -> float:
+        """Error of a run in terms of the target; inf where it is lost."""
+        error = distance(self.pilot(num_steps)[-1], final) / self.scale(final) / self.error
+        return error if math.isfinite(error) else math.inf
+
+    def implicit_steps(self, final: np.ndarray, fewer_than: int) -> int | None:
         """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that few."""
-        run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.target(ladder)
+        run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.error * self.scale(final)
         num_steps, met = 1, False
-        while num_steps < min(fewer_than, self.most // 16):
-            before, met = met, ladder.error_of(run(num_steps)[-1]) <= aim
+        while num_steps < min(fewer_than, self.most // 64):
+            before, met = met, distance(run(num_steps)[-1], final) <= aim
             if before and met:  # twice running: no accident
                 return num_steps // 2
             num_steps *= 2
