@@ -1,41 +1,57 @@
-"""advise_step on published initial value problems: achieved error against target, for each (problem, target).
+"""advise_step over its steps, problems, spring scenes and switched fields: achieved error against target.
 
-    python benchmarks/step_advice.py ../shared/reference/ode_problems.json [part of a name]
+    python benchmarks/step_advice.py [problems | scenes | switched] [--part NAME] [--steps euler rk4] [--targets 1e-2]
 
-The error is relative, |y - reference| / |reference| at t1, for `euler_step` in float64. Every answer is run that
-advances at most 1e10 numbers; one, of 410 million steps of 28 numbers, is not: it would take ten minutes or more. Where
-the error is less than a third of the target, larger dts are run too, 1,000 of them over the first 10 % and 500 up to
-the whole interval. One of them would have done if it meets the target, also with y0 moved by 1e-13 of itself, and comes
-within a factor 3 with dt 1 % larger: all else balances on the edge of instability.
+Errors are relative, |y - reference| / |reference| at t1, in float64. References: published end values; for scenes, runs
+of `solve_adaptive` at rtol 1e-12; for fields that switch or kink, exact solutions written out piece by piece. Every
+answer is run that advances at most 3e9 numbers (3e7 where a step solves equations). Reasons are checked by runs:
+
+- "confirmed", "predicted": the error is between a third of the target and 1.1 of it;
+- "stability sets dt": none of 60 larger dts, up to twice as large, meets the target and comes within a factor 3 of it
+  with dt 1 % larger;
+- "with one step fewer": that run misses the target;
+- linearly implicit steps named: their run meets the target;
+- refused for stability: a run of half the steps that it asks for is lost or misses the target.
 """
 
+import argparse
 import collections
 import math
 import pathlib
+import re
 import sys
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from arguments import REQUIRED, arguments
 
 import jeuler
 from jeuler.accuracy.pilot import Pilot, distance
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parent.parent / "tests"))
-from published import problems_in
+from advice_problems import FIELDS, more_problems, spring_scenes
+from published import Published, problems_in
 
-LONGEST = 1e10  # numbers advanced in a run, steps times the size of the state
+STEPS = {
+    "euler": jeuler.euler_step,
+    "heun": jeuler.heun_step,
+    "rk4": jeuler.rk4_step,
+    "extrapolated": jeuler.extrapolated_euler(4),
+    "implicit": jeuler.implicit_euler_step,
+    "linearly implicit": jeuler.linearly_implicit_euler_step,
+    "symplectic": jeuler.symplectic_euler_step,
+}
+LONGEST, LONGEST_IMPLICIT = 3e9, 3e7  # numbers advanced
+ABOVE, FACTOR = 1.1, 3.0
 
 
 class Runs:
-    """Relative errors of runs of one problem, each made once."""
+    """Errors of runs of one problem by one step, in terms of a target, each made once."""
 
-    def __init__(self, problem, moved=0.0):
-        y0 = problem.y0 * (1 + moved)
-        self.run = Pilot(problem.f, y0, problem.t0, problem.t1, None, jeuler.euler_step, float, False)
-        self.reference = problem.reference
-        self.known = {}
+    def __init__(self, problem, args, step):
+        self.run = Pilot(problem.f, problem.y0, problem.t0, problem.t1, args, step, float, False)
+        self.reference, self.known = problem.reference, {}
 
     def __call__(self, num_steps):
         if num_steps not in self.known:
@@ -44,59 +60,106 @@ class Runs:
         return self.known[num_steps]
 
 
-def larger_steps(runs, moved, num_steps, target):
-    """Whether a dt larger than the advised one would do, and in words how many come near the target and hold there."""
-    parts = np.concatenate([np.linspace(1, 0.9, 1001), np.geomspace(0.9, 1 / num_steps, 500)])
-    counts = [int(n) for n in np.unique(np.round(num_steps * parts))[::-1] if n < num_steps]
-    near = [n for n in counts if target / 3 <= runs(n) <= 3 * target]
-    if not near:
-        return False, f"none of {len(counts):,} larger dts has an error within a factor 3 of the target"
-    one_percent_more = {n: runs(math.ceil(0.99 * n)) / target for n in near}
-    apart = max(max(moved(n) / runs(n), runs(n) / moved(n)) for n in near)
-    hold = [n for n in near if max(runs(n), moved(n)) <= target and one_percent_more[n] <= 3]
-    return bool(hold), (
-        f"of {len(counts):,} larger dts {len(near)} come within a factor 3 of the target, in a window of "
-        f"{(near[0] - near[-1] + 1) / near[0]:.2%} of dt; {len(hold)} meet it and hold: with dt 1 % larger the error "
-        f"is up to {max(one_percent_more.values()):.1e} times the target; with y0 moved it changes {apart:.2g} times"
+def larger_would_do(runs, num_steps, target):
+    """Whether a larger dt meets the target, and with dt 1 % larger still comes within a factor 3."""
+    counts = sorted({int(n) for n in np.round(num_steps * np.geomspace(0.98, 0.5, 60)) if n < num_steps})
+    return any(runs(n) <= target and runs(math.ceil(0.99 * n)) <= FACTOR * target for n in counts if n)
+
+
+def false_reason(advice, runs, linear, target):
+    """What is false in the reason of an answer that was run, or ''."""
+    reason, ratio = advice.reason, runs(advice.num_steps) / target
+    named = re.search(r"linearly_implicit_euler_step meets the target with ([\d,]+)", reason)
+    if named and linear(int(named[1].replace(",", ""))) > ABOVE * target:
+        return "the linearly implicit steps that it names miss the target"
+    if ("confirmed" in reason or "predicted" in reason) and not 1 / FACTOR <= ratio <= ABOVE:
+        return "neither confirmed nor predicted"
+    if "with one step fewer" in reason and runs(advice.num_steps - 1) <= 0.8 * target:
+        return "one step fewer would do"
+    if "stability, not" in reason and larger_would_do(runs, advice.num_steps, 0.8 * target):
+        return "a larger dt would do"
+    return ""
+
+
+def false_refusal(advice, runs, target, longest):
+    """What is false in a refusal, or ''."""
+    needs = re.search(r"asks? for dt <= ([\d.e+-]+) s, ([\d.e+]+) steps", advice.reason)
+    if needs and float(needs[2]) / 2 < longest and runs(int(float(needs[2]) / 2)) <= target / FACTOR:
+        return "half the steps that it asks for would do"
+    return ""
+
+
+def check(tally, title, problem, args, step_name, target):
+    """One answer: a line printed, and counted."""
+    step = STEPS[step_name]
+    runs = Runs(problem, args, step)
+    linear = Runs(problem, args, jeuler.linearly_implicit_euler_step)
+    begun = time.process_time()
+    advice = jeuler.advise_step(problem.f, problem.y0, t0=problem.t0, t1=problem.t1, args=args, error=target, step=step)
+    seconds = time.process_time() - begun
+    tally["seconds"].append(seconds)
+    explicit = hasattr(getattr(step, "base", step), "increment")
+    longest = (LONGEST if explicit else LONGEST_IMPLICIT) / np.size(problem.reference)
+    ratio, wrong = math.nan, ""
+    if not advice.feasible:
+        kind, wrong = "refused", false_refusal(advice, runs, target, longest)
+    elif advice.num_steps > longest:
+        kind = "not run"
+    else:
+        ratio, wrong = runs(advice.num_steps) / target, false_reason(advice, runs, linear, target)
+        bound = "stability, not" in advice.reason or "one step" in advice.reason
+        kind = (
+            "above" if ratio > ABOVE else "near" if ratio >= 1 / FACTOR else "bound" if bound and not wrong else "far"
+        )
+    tally[kind].append(ratio)
+    tally["false"] += [wrong] * bool(wrong)
+    print(
+        f"{title:22s} {step_name:17s} {target:.0e} {ratio:6.2f} {kind:8s}{seconds:5.1f} s  {advice.reason}", flush=True
+    )
+    if wrong:
+        print(f"{'':40s}FALSE: {wrong}", flush=True)
+
+
+def report(tally):
+    run = [ratio for kind in ("above", "near", "bound", "far") for ratio in tally[kind]]
+    free = len(tally["near"]) + len(tally["far"]) + len(tally["above"])
+    print(
+        f"{len(run)} answers run, {len(tally['not run'])} too long to run, {len(tally['refused'])} refused; "
+        f"the largest error is {max(run, default=math.nan):.2f} of its target, {len(tally['above'])} above {ABOVE}; "
+        f"where neither stability nor one step more decides, {len(tally['near'])} of {free} are within a factor "
+        f"{FACTOR:g}, {len(tally['near']) / max(1, free):.1%}; {len(tally['false'])} false reasons; "
+        f"CPU seconds an answer: median {np.median(tally['seconds']):.1f}, longest {max(tally['seconds']):.1f}"
     )
 
 
-def main(path, part=""):
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", nargs="?", choices=("problems", "scenes", "switched"), default="problems")
+    parser.add_argument("--part", default="", help="only those with this in their name; several by commas")
+    parser.add_argument("--steps", nargs="+", choices=list(STEPS), default=None)
+    parser.add_argument("--targets", type=float, nargs="+", default=[1e-2, 1e-4])
+    given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    problems = {name: problem for name, problem in problems_in(path).items() if part in name}
-    ratios, kinds, seconds = [], collections.Counter(), []
-    for name, problem in problems.items():
-        runs, moved = Runs(problem), Runs(problem, moved=1e-13)
-        for target in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5):
-            begin = time.process_time()
-            advice = jeuler.advise_step(problem.f, problem.y0, t0=problem.t0, t1=problem.t1, error=target)
-            seconds.append(time.process_time() - begin)
-            run_it = advice.feasible and advice.num_steps * problem.y0.size <= LONGEST
-            ratio = runs(advice.num_steps) / target if run_it else math.nan
-            print(f"{name:22s} {target:.0e}  {ratio:8.2g}  {seconds[-1]:4.1f} s  {advice.reason}", flush=True)
-            if not run_it:
-                kinds["unchecked" if advice.feasible else "refused"] += 1
-                continue
-            ratios.append(ratio)
-            if ratio < 1 / 3:
-                missed, evidence = larger_steps(runs, moved, advice.num_steps, target)
-                kinds["missed" if missed else "stability"] += 1
-                print(f"{'':44s}{evidence}", flush=True)
-    ratios = np.array(ratios)
-    near = np.sum((ratios >= 1 / 3) & (ratios <= 3))
-    print(f"{ratios.size} answers run, {kinds['unchecked']} too long to run; at most {ratios.max():.2f} of the target")
-    print(f"within a factor 3 of the target, on both sides: {near}, {near / ratios.size:.1%} of all")
-    print(
-        f"better than that: {kinds['stability']} where no larger dt meets the target and holds (stability sets dt), "
-        f"{kinds['missed']} where one would have done"
-    )
-    print(f"within a factor 3 where accuracy sets dt: {near / (ratios.size - kinds['stability']):.1%}")
-    print(
-        f"{kinds['refused']} refused, with a reason; CPU seconds an answer: median {np.median(seconds):.1f}, "
-        f"longest {max(seconds):.1f}"
-    )
+    if given.what == "scenes":
+        cases = {name: (Published(f, y0, 0.0, t1, end), args) for name, (f, y0, t1, args, end) in spring_scenes()}
+        steps = given.steps or ["symplectic", "rk4"]
+    elif given.what == "switched":
+        cases = {
+            name: (Published(f, jnp.asarray(y0, float), 0.0, t1, np.atleast_1d(end)), None)
+            for name, (f, y0, t1, end) in FIELDS.items()
+        }
+        steps = given.steps or ["euler", "heun", "rk4", "extrapolated"]
+    else:
+        cases = {name: (problem, None) for name, problem in {**problems_in(), **more_problems()}.items()}
+        steps = given.steps or [name for name in STEPS if name != "symplectic"]
+    tally = collections.defaultdict(list)
+    for name, (problem, args) in cases.items():
+        if any(part in name for part in given.part.split(",")):
+            for step_name in steps:
+                for target in given.targets:
+                    check(tally, name, problem, args, step_name, target)
+    report(tally)
 
 
 if __name__ == "__main__":
-    given = arguments(__doc__, path=REQUIRED, part="")
-    main(given.path, given.part)
+    main()

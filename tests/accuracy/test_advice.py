@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from advice_problems import FIELDS, more_problems
 from published import published
 
 import jeuler
@@ -177,6 +178,44 @@ def test_no_answer_is_above_its_target_where_the_field_switches(step, target):
     assert advice.feasible
     run = jeuler.solve(driven, 110.0, dt=advice.dt, num_steps=advice.num_steps, step=step)
     assert abs(float(run.y[-1]) / 19.981344941683865 - 1) <= 1.1 * target
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if name != "floor"])
+def test_no_answer_is_above_its_target_on_fields_that_switch_or_kink(name):
+    f, y0, t1, end = FIELDS[name]
+    advice = advise_step(f, y0, t1=t1, error=1e-2, step=jeuler.heun_step)
+    assert advice.feasible
+    run = jeuler.solve(
+        f, y0, dt=advice.dt, num_steps=advice.num_steps, save_every=advice.num_steps, step=jeuler.heun_step
+    )
+    assert abs(float(run.y[-1]) / end - 1) <= 1.1e-2
+
+
+def test_known_breaks_let_high_orders_do_with_few_steps():
+    breaks = range(21)
+    advice = advise_step(driven, 110.0, t1=20.0, error=1e-6, step=jeuler.rk4_step, breaks=breaks)
+    assert advice.num_steps < 1000
+    run = jeuler.solve(driven, 110.0, dt=advice.dt, num_steps=advice.num_steps, step=jeuler.rk4_step, breaks=breaks)
+    assert abs(float(run.y[-1]) / 19.981344941683865 - 1) <= 1e-6
+
+
+def test_stiff_problems_are_answered_or_told_what_meets_the_target():
+    """Oregonator: no explicit step is advised, and the run that is named instead meets the target."""
+    f, y0, t0, t1, reference = more_problems()["OREGO"]
+    advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2, step=jeuler.rk4_step)
+    assert not advice.feasible
+    assert "stability alone asks for dt <=" in advice.reason
+    assert "extrapolated_euler(6, step=linearly_implicit_euler_step)" in advice.reason
+    step = jeuler.extrapolated_euler(6, step=jeuler.linearly_implicit_euler_step)
+    run = jeuler.solve_adaptive(f, y0, t0=t0, t1=t1, rtol=1e-6, atol=1e-6, step=step)
+    assert np.linalg.norm(run.y[-1] - reference) < 1e-2 * np.linalg.norm(reference)
+
+
+def test_an_eccentric_orbit_is_answered():
+    f, y0, t0, t1, reference = more_problems()["DETEST_nonstiff_D5"]
+    advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2, step=jeuler.rk4_step)
+    run = Pilot(f, y0, t0, t1, None, jeuler.rk4_step, np.float64, False)
+    assert 1 / 3 < distance(run(advice.num_steps)[-1], reference) / np.linalg.norm(reference) / 1e-2 < 1.1
 
 
 def test_growth_of_the_solution_itself_does_not_bind_symplectic_euler():

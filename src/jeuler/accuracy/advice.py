@@ -26,6 +26,7 @@ PILOT_WORK = 2**25  # numbers advanced in the longest pilot run
 IMPLICIT_WORK = 16  # times the work of an explicit step that of one which solves equations is taken to be
 FEW = 64  # steps: one fewer may make a difference
 LARGER = 0.9  # part of the steps at whose dt instability is to be seen if it is what sets dt:
+NEAR_LIMIT = 0.2  # of the stable dt; and it grows by
 UNSTABLE = 4.0  # times the error that the order says
 
 
@@ -138,7 +139,8 @@ def advise_step(
     checks.true_or_false("relative", relative)
     checks.true_or_false("compensated", compensated)
     if max_pilot_steps is None:
-        max_pilot_steps = max(4096, PILOT_WORK // max(1, flat(y0).size))
+        work = PILOT_WORK if is_explicit(step) else PILOT_WORK // IMPLICIT_WORK
+        max_pilot_steps = max(4096, work // max(1, flat(y0).size))
     max_pilot_steps = checks.count("max_pilot_steps", max_pilot_steps, least=64)
     search = Search(
         f,
@@ -155,6 +157,11 @@ def advise_step(
     )
     advice = _Words(search).advice()
     return dataclasses.replace(advice, reason=advice.reason + left_out)
+
+
+def is_explicit(step: Any) -> bool:
+    """Whether a step solves no equations."""
+    return hasattr(getattr(step, "base", step), "increment")
 
 
 class _Words:
@@ -201,19 +208,17 @@ class _Words:
         if self.search.reference is None:
             return "; no adaptive run was seen to meet it either; raise max_pilot_steps, or take a shorter interval"
         words = f"; use {self.search.reference.words}, whose run is known to meet the target"
-        fewer = self.search.implicit_steps(self.search.reference.final, 4096) if self.is_explicit else None
+        fewer = self.search.implicit_steps(self.search.reference.final, 4096) if is_explicit(self.search.step) else None
         return words + (f", or {fewer:,} step{'s' * (fewer > 1)} of linearly_implicit_euler_step" if fewer else "")
-
-    @property
-    def is_explicit(self) -> bool:
-        step = self.search.step
-        return hasattr(getattr(step, "base", step), "increment")
 
     def answer(self, ladder: Ladder) -> StepAdvice:
         search = self.search
         target, scale = search.target(ladder), search.scale(ladder.best)
         seen = ladder.errors()[-1] <= AIM * target
         num_steps, error = search.fewest(ladder) if seen else search.predicted(ladder)
+        if seen and error < target / FACTOR and not self.near_instability(num_steps):
+            final: Any = ladder.best if search.reference is None else search.reference.final
+            num_steps, error = search.uneven(final, start=max(1, num_steps // 4)) or (num_steps, error)
         rounding = search.rounding(ladder)
         self.floor, _ = rounding.floor(error / scale * num_steps**search.order, search.order)
         total = error / scale + rounding.after(num_steps)
@@ -229,7 +234,7 @@ class _Words:
                 f"use {self.finer_step()} or an adaptive solver"
             )
         if error < target / FACTOR:
-            how = self.far_below(ladder, num_steps, target / error)
+            how = self.far_below(ladder.best, num_steps, target / error)
         elif seen:
             how = "confirmed by a pilot run of that dt"
         else:
@@ -246,29 +251,35 @@ class _Words:
         total = error / search.scale(final) + rounding.after(num_steps)
         if total > search.error:
             return self.refusal(f"roundoff in {search.dtype} leaves no error below {total:.1e}", total)
+        if error < search.error * search.scale(final) / FACTOR:
+            how = self.far_below(final, num_steps, search.error * search.scale(final) / error)
+        else:
+            how = "confirmed by a pilot run of that dt"
         reason = (
-            f"{num_steps:,} steps: confirmed by a pilot run of that dt against an adaptive run; the error does not "
-            "fall evenly with dt, as where f jumps"
+            f"{num_steps:,} steps: {how}; against an adaptive run, as the error was not seen to fall evenly with dt"
         )
         return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
 
-    def far_below(self, ladder: Ladder, num_steps: int, better: float) -> str:
+    def far_below(self, final: Any, num_steps: int, better: float) -> str:
         """Why an error is far below the target: as one step fewer misses it, or as larger dts grow or jump."""
         search, smaller = self.search, f"the error is {better:.2g} times smaller than asked"
         if num_steps == 1:
             return f"one step is enough: {smaller}"
-        final: Any = ladder.best
         fewer = min(math.floor(LARGER * num_steps), num_steps - 1)
         growth = search.error_after(fewer, final) * better / (num_steps / fewer) ** search.order
-        if growth < UNSTABLE:  # no more than the order says, or little more
+        if growth < UNSTABLE or not self.near_instability(num_steps):
             one_fewer = search.error_after(num_steps - 1, final)
             if num_steps <= FEW and one_fewer > AIM:
                 return f"{smaller}, but with one step fewer it is {one_fewer:.2g} times the target"
-            return f"{smaller}; larger dts do not meet the target, or not within a factor 3 with dt 1 % larger"
+            return f"{smaller}; no larger dt that was run meets the target with runs beside it within a factor 3"
         how = f"stability, not accuracy, sets dt: {smaller}"
-        if self.is_explicit and (steps := search.implicit_steps(final, num_steps // 2)):
+        if is_explicit(self.search.step) and (steps := search.implicit_steps(final, num_steps // 2)):
             how += f"; linearly_implicit_euler_step meets the target with {steps:,} step{'s' * (steps > 1)}"
         return how
+
+    def near_instability(self, num_steps: int) -> bool:
+        """Whether dt is not far below a limit of stability at the states looked at."""
+        return self.search.interval / num_steps > NEAR_LIMIT * self.search.stability
 
     def needs(self) -> str:
         bound = self.search.bound

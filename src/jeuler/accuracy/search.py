@@ -32,7 +32,7 @@ OFF = 0.93, 0.79, 0.61  # parts of the finest rung: numbers of steps that share 
 EVEN = 2.5  # times the error that the order of the step tells of them
 BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
 FINER = 1.1  # from one number of steps to the next where errors are uneven
-REFERENCE_RTOL = 1e-8, 1e-11  # of adaptive runs; the second is the reference
+REFERENCE_RTOL = 1e-8, 1e-11, 1e-13  # of adaptive runs; the first that agrees with the one before is the reference
 REFERENCE_STEPS, STIFF_REFERENCE_STEPS = 65_536, 8_192
 STIFF_STEP = extrapolated_euler(6, step=linearly_implicit_euler_step)
 STIFF_WORDS = "solve_adaptive with step=extrapolated_euler(6, step=linearly_implicit_euler_step)"
@@ -67,6 +67,7 @@ class Search:
     compensated: bool
     most: int
     breaks: tuple[float, ...]
+    disagreeing: bool  # whether adaptive runs came to different ends
     interval: float
     order: int
     dtype: Any
@@ -92,7 +93,7 @@ class Search:
     ) -> None:
         self.f, self.start, self.t0, self.t1, self.args, self.step = f, y0, t0, t1, args, step
         self.error, self.relative, self.compensated, self.most = error, relative, compensated, most
-        self.breaks = breaks
+        self.breaks, self.disagreeing = breaks, False
         self.interval = t1 - t0
         self.order = int(getattr(step, "order", 1))
         self.dtype = np.dtype(trees.time_dtype(y0))
@@ -213,7 +214,10 @@ class Search:
         """
         finest, error = ladder.num_steps[-1], float(ladder.errors()[-1])
         known = 2 * TRUST * max(self.target(ladder), error)
-        if self.reference is not None and ladder.error_of(self.reference.final) > known:
+        if self.reference is None:
+            if self.disagreeing:
+                return False
+        elif ladder.error_of(self.reference.final) > known:
             return False
         floor = 1e-12 * float(np.linalg.norm(ladder.finals[-1])) + 2 * ladder.doubt
         for part in OFF:
@@ -237,7 +241,7 @@ class Search:
                 (None, REFERENCE_STEPS, "solve_adaptive"),
                 (STIFF_STEP, STIFF_REFERENCE_STEPS, STIFF_WORDS),
             ):
-                states = []
+                before = None
                 for rtol in REFERENCE_RTOL:
                     run = solve_adaptive(
                         self.f,
@@ -251,34 +255,38 @@ class Search:
                         max_steps=min(most, max(256, self.most // 8)),
                         breaks=self.breaks,
                     )
-                    states.append(flat_rows(run.y)[1:])
-                loose, tight = (rows[-1] for rows in states)
-                known = distance(loose, tight) <= TRUST * self.error * self.scale(tight)
-                if np.all(np.isfinite(tight)) and known:
-                    return Reference(times, states[-1], words)
+                    states = flat_rows(run.y)[1:]
+                    if not np.all(np.isfinite(states[-1])):
+                        break
+                    if before is not None:
+                        if distance(before, states[-1]) <= TRUST * self.error * self.scale(states[-1]):
+                            return Reference(times, states, words)
+                        self.disagreeing = True
+                    before = states[-1]
+                    size = min(size, float(np.linalg.norm(before)) or size)  # what decays is known in its own terms
         return None
 
-    def uneven(self, final: np.ndarray) -> tuple[int, float] | None:
-        """The fewest steps of a fine scan whose own run meets the aim, with runs beside it near the target.
+    def uneven(self, final: np.ndarray, start: int = 0) -> tuple[int, float] | None:
+        """The fewest steps of a scan, 10 % and then 1 % apart, whose own run meets the aim, with runs beside it near.
 
-        It begins at a quarter of the steps that stability asks for.
+        It begins at a quarter of the steps that stability asks for, or at ``start``.
         """
-        target = self.error * self.scale(final)
-        aim, spent = AIM * target, 0
-        num_steps = max(1, math.floor(self.interval / self.bound / 4))
-
-        def error_of(num_steps: int) -> float:
-            error = distance(self.pilot(num_steps)[-1], final)
-            return error if math.isfinite(error) else math.inf
-
-        while num_steps <= self.most and spent <= 4 * self.most:
+        aim, least = AIM, start or max(1, math.floor(self.interval / self.bound / 4))
+        error_of = functools.cache(functools.partial(self.error_after, final=final))
+        beside = lambda n: (max(1, round(n * part)) for part in BESIDE)  # noqa: E731
+        meets = lambda n: error_of(n) <= aim and all(error_of(m) <= FACTOR for m in beside(n))  # noqa: E731
+        num_steps, spent = least, 0
+        while num_steps <= self.most and spent <= 2 * self.most:
+            if meets(num_steps):
+                break
             spent += num_steps
-            error = error_of(num_steps)
-            beside = [round(num_steps * part) for part in BESIDE]
-            if error <= aim and all(error_of(max(n, 1)) <= FACTOR * target for n in beside):
-                return num_steps, error
             num_steps = max(num_steps + 1, round(FINER * num_steps))
-        return None
+        else:
+            return None
+        if error_of(num_steps) < 1 / FACTOR and num_steps <= self.most // 16:
+            between = np.linspace(num_steps / FINER, num_steps, 10)
+            num_steps = next((n for n in map(math.ceil, between) if n >= least and meets(n)), num_steps)
+        return num_steps, error_of(num_steps) * self.error * self.scale(final)
 
     def error_after(self, num_steps: int, final: np.ndarray) -> float:
         """Error of a run in terms of the target; inf where it is lost."""
