@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -159,48 +159,59 @@ def _solve_adaptive(
     asked = jnp.argsort(order)[: times.size]  # where the times are among the stops
     stops = stops[order]
 
-    def try_step(f, end, carry):
-        t, y, dt, error_sum, accepted, rejected, failed, tried = carry
-        last = t + dt * (1 + 1e-3) >= end
-        h = jnp.where(last, end - t, dt)
-        increment, error = step.increment_with_error(f, t, y, h, args)
-        y_next = trees.add(y, increment)
-        ratio = lax.stop_gradient(error_ratio(error, y, y_next, rtol, atol))
-        ratio = ratio / getattr(step, "allowed", 1.0)
-        good = ratio <= jnp.where(failed, STRICT, 1)
-        aimed = jnp.maximum(ratio, 1e-12) / jnp.where(good, 1, STRICT)
-        factor = jnp.where(jnp.isfinite(ratio), 0.9 * aimed ** (-1 / step.order), 0.2)
-        wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
-        shortened = good & last  # to stop at a time: no reason for a smaller dt
-        dt = jnp.where(shortened, jnp.maximum(wanted, dt), wanted)
-        take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)  # noqa: E731
-        t = jnp.where(good, jnp.where(last, end, t + h), t)
-        return (
-            t,
-            take(y_next, y),
-            dt,
-            take(trees.add(error_sum, error), error_sum),
-            accepted + good,
-            rejected + ~good,
-            ~good,
-            tried + 1,
-        )
-
-    def to_time(carry, ends):
+    def to_time(at: _Way, ends: tuple[Array, Array]) -> tuple[_Way, tuple[PyTree, Array]]:
         begin, end = ends
         here = between(f, breaks, begin, end) if breaks.size else f
-        carry = (*carry, jnp.asarray(False), jnp.int32(0))
-        going = lambda c: (c[0] < end) & (c[-1] < max_steps)  # noqa: E731
-        *carry, _, _ = bounded_while(going, lambda c: try_step(here, end, c), carry, max_steps)
-        reached = carry[0] >= end
-        kept = jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), carry[1])
-        return tuple(carry), (kept, reached)
+        at = at._replace(failed=jnp.asarray(False), tried=jnp.int32(0))
+        going = lambda at: (at.t < end) & (at.tried < max_steps)  # noqa: E731
+        at = bounded_while(going, lambda at: _try_step(step, here, args, end, at, rtol, atol), at, max_steps)
+        reached = at.t >= end
+        return at, (jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), at.y), reached)
 
-    none = jnp.int32(0)
-    start = t0, y0, jnp.asarray(dt0, times.dtype), jax.tree.map(jnp.zeros_like, y0), none, none
-    (_, _, _, error, accepted, rejected), (y, reached) = lax.scan(to_time, start, (jnp.append(t0, stops[:-1]), stops))
+    none, no_error = jnp.int32(0), jax.tree.map(jnp.zeros_like, y0)
+    start = _Way(t0, y0, jnp.asarray(dt0, times.dtype), no_error, none, none, jnp.asarray(False), none)
+    end, (y, reached) = lax.scan(to_time, start, (jnp.append(t0, stops[:-1]), stops))
     y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[asked]]), y0, y)
-    return AdaptiveSolution(jnp.append(t0, times), y, accepted, rejected, error, reached[-1])
+    return AdaptiveSolution(jnp.append(t0, times), y, end.accepted, end.rejected, end.error, reached[-1])
+
+
+class _Way(NamedTuple):
+    """Where a run is on its way to the next time at which it stops."""
+
+    t: Array
+    y: PyTree
+    dt: Array  # of the next step to try
+    error: PyTree  # sum of the estimated errors
+    accepted: Array
+    rejected: Array
+    failed: Array  # whether the last step was rejected
+    tried: Array  # steps since the last stop
+
+
+def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Way, rtol: Any, atol: Any) -> _Way:
+    """A step, taken if its error is within tolerance, and the size of the next; not past ``end``."""
+    last = at.t + at.dt * (1 + 1e-3) >= end
+    h = jnp.where(last, end - at.t, at.dt)
+    increment, error = step.increment_with_error(f, at.t, at.y, h, args)
+    y = trees.add(at.y, increment)
+    ratio = lax.stop_gradient(error_ratio(error, at.y, y, rtol, atol))
+    ratio = ratio / getattr(step, "allowed", 1.0)
+    good = ratio <= jnp.where(at.failed, STRICT, 1)
+    aimed = jnp.maximum(ratio, 1e-12) / jnp.where(good, 1, STRICT)
+    factor = jnp.where(jnp.isfinite(ratio), 0.9 * aimed ** (-1 / step.order), 0.2)
+    wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
+    shortened = good & last  # to stop at a time: no reason for a smaller dt
+    take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)  # noqa: E731
+    return _Way(
+        t=jnp.where(good, jnp.where(last, end, at.t + h), at.t),
+        y=take(y, at.y),
+        dt=jnp.where(shortened, jnp.maximum(wanted, at.dt), wanted),
+        error=take(trees.add(at.error, error), at.error),
+        accepted=at.accepted + good,
+        rejected=at.rejected + ~good,
+        failed=~good,
+        tried=at.tried + 1,
+    )
 
 
 def _in_order(t0: Array, times: Array) -> Array:

@@ -13,6 +13,7 @@ integers.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -63,60 +64,6 @@ def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyT
         t = t0 + n.astype(dt.dtype) * dt
         return pair(f_closed(t, unflatten((x, v)), args, *hoisted))[0][1]
 
-    def kick(n: Array, x: PyTree, v: PyTree, parameters: list[Array], quanta: PyTree) -> PyTree:
-        """[dt a(t, x)], compiled alike wherever it stands: the compiler cannot merge a branch with what is around it,
-        nor know that it is always taken. Merged, it differs in the last bit, forward from backward."""
-
-        def taken(x, v, parameters, quanta):
-            return rounded(trees.scale(parameters[0], acceleration(n, x, v, parameters)), quanta[1])
-
-        return lax.cond(n >= 0, taken, lambda x, v, *_: v, x, v, parameters, quanta)
-
-    def drift(v: PyTree, parameters: list[Array], quanta: PyTree) -> PyTree:
-        return rounded(trees.scale(parameters[0], v), quanta[0])
-
-    def forward(n, first_nonfinite, y, parameters, quanta):
-        def one_step(carry, _):
-            n, first_nonfinite, (x, v) = carry
-            v = trees.add(v, kick(n, x, v, parameters, quanta))
-            x = trees.add(x, drift(v, parameters, quanta))
-            n = n + 1
-            newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite((x, v))
-            return (n, jnp.where(newly_nonfinite, n, first_nonfinite), (x, v)), None
-
-        (_, first_nonfinite, y), _ = lax.scan(one_step, (n, first_nonfinite, y), None, length=grid.save_every)
-        return first_nonfinite, y
-
-    def kept(n, first_nonfinite, y, parameters, quanta):
-        out = forward(n, first_nonfinite, y, parameters, quanta)
-        return out, (n, fingerprint(y), out[1], parameters, quanta)
-
-    def backward(residuals, cotangents):
-        n, start, end, parameters, quanta = residuals
-        dt = parameters[0]
-
-        def one_step_back(carry, _):
-            n, (x, v), (x_bar, v_bar), bars = carry
-            n = n - 1
-            x = trees.subtract(x, drift(v, parameters, quanta))
-            a, pull_back = jax.vjp(lambda x, p: acceleration(n, x, v, p), x, parameters)
-            v_bar = trees.add(v_bar, trees.scale(dt, x_bar))
-            dt_bar = (_dot(x_bar, v) + _dot(v_bar, a)).astype(dt.dtype)
-            by_x, by_parameters = pull_back(trees.scale(dt, v_bar))
-            bars = trees.add(bars, [by_parameters[0] + dt_bar, *by_parameters[1:]])
-            v = trees.subtract(v, kick(n, x, v, parameters, quanta))
-            return (n, (x, v), (trees.add(x_bar, by_x), v_bar), bars), None
-
-        nothing = [jnp.zeros_like(p) for p in parameters]
-        carry = (n + grid.save_every, end, cotangents[1], nothing)
-        (_, found, y_bar, bars), _ = lax.scan(one_step_back, carry, None, length=grid.save_every)
-        undone = fingerprint(found) == start
-        y_bar, bars = jax.tree.map(lambda x: jnp.where(undone, x, jnp.nan), (y_bar, bars))
-        return None, None, y_bar, bars, None
-
-    run = jax.custom_vjp(forward)
-    run.defvjp(kept, backward)
-
     def field(n: Array, y: PyTree, parameters: list[Array]) -> PyTree:
         x, v = y
         return v, acceleration(n, x, v, parameters)
@@ -124,12 +71,79 @@ def reversible(f: VectorField, y0: PyTree, args: PyTree, grid: Any) -> tuple[PyT
     largest = _largest(field, *lax.stop_gradient((pair(y0)[0], parameters)), grid.num_steps)
     quanta = jax.tree.map(quantum, largest)
     start = jax.tree.map(_on_grid, pair(y0)[0], quanta)
+    steps = _Steps(acceleration, grid.save_every)
+    run = jax.custom_vjp(steps.forward)
+    run.defvjp(steps.kept, steps.backward)
 
     def between_saves(n: Array, first_nonfinite: Array, y: PyTree) -> tuple[Array, PyTree]:
         first_nonfinite, y = run(n, first_nonfinite, pair(y)[0], parameters, quanta)
         return first_nonfinite, unflatten(y)
 
     return unflatten(start), between_saves
+
+
+@dataclasses.dataclass(frozen=True)
+class _Steps:
+    """The steps from one saved state to the next, forward and back; parameters[0] is dt."""
+
+    acceleration: Callable[..., Any]
+    count: int
+
+    def kick(self, n: Array, x: PyTree, v: PyTree, parameters: list[Array], quanta: PyTree) -> PyTree:
+        """[dt a(t, x)], compiled alike wherever it stands: the compiler cannot merge a branch with what is around it,
+        nor know that it is always taken. Merged, it differs in the last bit, forward from backward."""
+
+        def taken(x, v, parameters, quanta):
+            return rounded(trees.scale(parameters[0], self.acceleration(n, x, v, parameters)), quanta[1])
+
+        return lax.cond(n >= 0, taken, lambda x, v, *_: v, x, v, parameters, quanta)
+
+    def drift(self, v: PyTree, parameters: list[Array], quanta: PyTree) -> PyTree:
+        """[dt v]"""
+        return rounded(trees.scale(parameters[0], v), quanta[0])
+
+    def forward(self, n, first_nonfinite, y, parameters, quanta):
+        """The state after the steps, and which of them was the first that is not finite."""
+
+        def one_step(carry, _):
+            n, first_nonfinite, (x, v) = carry
+            v = trees.add(v, self.kick(n, x, v, parameters, quanta))
+            x = trees.add(x, self.drift(v, parameters, quanta))
+            n = n + 1
+            newly_nonfinite = (first_nonfinite < 0) & ~trees.all_finite((x, v))
+            return (n, jnp.where(newly_nonfinite, n, first_nonfinite), (x, v)), None
+
+        (_, first_nonfinite, y), _ = lax.scan(one_step, (n, first_nonfinite, y), None, length=self.count)
+        return first_nonfinite, y
+
+    def kept(self, n, first_nonfinite, y, parameters, quanta):
+        """What forward gives, and what the way back needs: the end, and a number by which it knows the start."""
+        out = self.forward(n, first_nonfinite, y, parameters, quanta)
+        return out, (n, fingerprint(y), out[1], parameters, quanta)
+
+    def backward(self, residuals, cotangents):
+        """The steps undone, and their derivative; NaN where the way back does not lead to the start."""
+        n, start, end, parameters, quanta = residuals
+        dt = parameters[0]
+
+        def one_step_back(carry, _):
+            n, (x, v), (x_bar, v_bar), bars = carry
+            n = n - 1
+            x = trees.subtract(x, self.drift(v, parameters, quanta))
+            a, pull_back = jax.vjp(lambda x, p: self.acceleration(n, x, v, p), x, parameters)
+            v_bar = trees.add(v_bar, trees.scale(dt, x_bar))
+            dt_bar = (_dot(x_bar, v) + _dot(v_bar, a)).astype(dt.dtype)
+            by_x, by_parameters = pull_back(trees.scale(dt, v_bar))
+            bars = trees.add(bars, [by_parameters[0] + dt_bar, *by_parameters[1:]])
+            v = trees.subtract(v, self.kick(n, x, v, parameters, quanta))
+            return (n, (x, v), (trees.add(x_bar, by_x), v_bar), bars), None
+
+        nothing = [jnp.zeros_like(p) for p in parameters]
+        carry = (n + self.count, end, cotangents[1], nothing)
+        (_, found, y_bar, bars), _ = lax.scan(one_step_back, carry, None, length=self.count)
+        undone = fingerprint(found) == start
+        y_bar, bars = jax.tree.map(lambda x: jnp.where(undone, x, jnp.nan), (y_bar, bars))
+        return None, None, y_bar, bars, None
 
 
 def quantum(largest: Array) -> Array:
