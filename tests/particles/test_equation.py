@@ -1,13 +1,11 @@
 """`simulate` solves the equation of motion; where drag is limited, by the rule that the drags' docstrings say."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from cases import FORCES, force_state, leapfrog_step
+from cases import FORCES, IN_SPACE, force_state, leapfrog_step
 from jax.test_util import check_grads
 
 import jeuler
@@ -26,7 +24,9 @@ STEPS = {
 }
 LIMITED = ("euler", "symplectic_euler")
 UNLIMITED = [name for name in STEPS if name not in LIMITED]
-FIRST_ORDER = (*LIMITED, "implicit_euler", "linearly_implicit_euler")
+IMPLICIT = ("implicit_euler", "linearly_implicit_euler")
+EXPLICIT = [name for name in STEPS if name not in IMPLICIT]
+FIRST_ORDER = (*LIMITED, *IMPLICIT)
 TIME = {"dt": 0.01, "num_steps": 2}
 
 
@@ -38,31 +38,49 @@ def both_ways(forces, state, step, **time):
     return (run.position, run.velocity), solution.y
 
 
-def agree(name, step, dtype, tolerance):
-    found, expected = both_ways((FORCES[name](),), force_state(name, dtype), step, **TIME)
+def agree(found, expected, what="", dtype=jnp.float64, tolerance=1e-12):
     for a, b in zip(found, expected, strict=True):
         assert a.dtype == dtype
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance, err_msg=what)
+
+
+def compiled(function, *arguments):
+    """The function compiled without the optimisations that take most of the time: what it computes is looked at."""
+    quick = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+    return jax.jit(function).lower(*arguments).compile(compiler_options=quick)(*arguments)
 
 
 @pytest.mark.parametrize("name", FORCES)
-@pytest.mark.parametrize("step", ["euler", "symplectic_euler", "rk4", "one's own"])
-def test_every_force_under_every_step_that_evaluates_it(name, step):
-    agree(name, STEPS[step], jnp.float64, 1e-12)
+def test_every_force_alone(name):
+    """Under a step that limits drag, and one that does not."""
+
+    def runs(state):
+        return {step: both_ways((FORCES[name](),), state, STEPS[step], **TIME) for step in ("euler", "rk4")}
+
+    for step, run in compiled(runs, force_state(name)).items():
+        agree(*run, step)
 
 
 @pytest.mark.parametrize("name", FORCES)
 def test_every_force_in_single_precision(name):
-    agree(name, jeuler.symplectic_euler_step, jnp.float32, 2e-6)
+    run = both_ways((FORCES[name](),), force_state(name, jnp.float32), jeuler.symplectic_euler_step, **TIME)
+    agree(*run, dtype=jnp.float32, tolerance=2e-6)
 
 
-@pytest.mark.parametrize("step", STEPS)
-def test_forces_together_under_every_step(step):
-    """What one of them does to the others' arguments would show."""
-    forces = tuple(FORCES[name]() for name in ("quadratic_drag", "gravity", "springs", "wind", "function"))
-    found, expected = jax.jit(functools.partial(both_ways, forces, step=STEPS[step], **TIME))(force_state("gravity"))
-    for a, b in zip(found, expected, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+IN_PLANE = [name for name in FORCES if name not in IN_SPACE]
+
+
+@pytest.mark.parametrize("names", [IN_PLANE, IN_SPACE], ids=["plane", "space"])
+@pytest.mark.parametrize("steps", [EXPLICIT, *([step] for step in IMPLICIT)], ids=["explicit", *IMPLICIT])
+def test_every_force_under_every_step(names, steps):
+    """All in one scene, as each step compiles for a second or more: what one does to the others' arguments shows too."""
+    forces = tuple(FORCES[name]() for name in names)
+
+    def runs(state):
+        return {step: both_ways(forces, state, STEPS[step], **TIME) for step in steps}
+
+    for step, run in compiled(runs, force_state(names[0])).items():
+        agree(*run, step)
 
 
 # --- drag that would overshoot ---------------------------------------------------------------------------------------
