@@ -176,3 +176,75 @@ def test_drag_is_replayed_as_simulate_runs_it():
     moving = jeuler.ParticleState([[0.0, 0.0]], [[1.0, 2.0]])
     found = diagnose(scene, moving, dt=0.1, num_steps=100, loss=lambda s: jnp.sum(s.position**2))
     assert found.finite
+
+
+# --- the cause where a hook changes the forces ------------------------------------------------------------------------
+
+
+def lost(scene, state, **run):
+    """The diagnosis, of the step in which `simulate` was lost."""
+    found = diagnose(scene, state, **run)
+    assert found.step == int(jeuler.simulate(scene, state, **run).first_nonfinite) > 1
+    return found
+
+
+def test_a_limited_drag_is_not_blamed_for_what_an_effect_does():
+    """c dt / m = 5: plain, the drag would be over its limit of 0.04 s."""
+
+    def scatter(t, dt, state, key):
+        return state.replace(position=1e40 * state.position)
+
+    scene = jeuler.Scene((jeuler.Gravity([0.0, -1.0]), jeuler.LinearDrag(50.0)), (scatter,))
+    found = lost(scene, COINCIDENT, dt=0.1, num_steps=20)
+    assert found.part == "effects[0] scatter"
+    assert "the numbers grew" in found.cause
+    assert "stability" not in found.cause
+
+
+def test_springs_beside_a_limited_drag_have_the_limit_of_that_step():
+    """v' = v - (ks x + c v) dt / (c dt) makes x' = (1 - ks dt / c) x, stable below 2 c / ks = 1 s; c dt / m = 15."""
+    scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks=20.0, kd=0.0, rest_length=0.0), jeuler.LinearDrag(10.0)))
+    state = jeuler.ParticleState([[0.0], [1.1]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
+    step = jeuler.symplectic_euler_step
+    assert "1.5 times the stability limit 1 s" in lost(scene, state, dt=1.5, num_steps=2000, step=step).cause
+    run = jeuler.simulate(scene, state, dt=0.99, num_steps=400, step=step)
+    assert abs(run.y.position[-1, 1, 0]) < 0.01
+
+
+def test_a_pool_that_is_empty_at_the_start_has_the_limit_of_those_born_later():
+    def hold(t, position, velocity, mass):
+        return -1000 * position
+
+    scene = jeuler.Scene((hold,), (jeuler.Emitter(0.0, [1.0], [0.0], bursts=((0.5, 1),)),))
+    run = {"dt": 0.1, "num_steps": 800, "step": jeuler.symplectic_euler_step, "key": jax.random.key(0)}
+    found = lost(scene, jeuler.empty_pool(2, dim=1), **run)
+    assert "1.58 times the stability limit 0.0632 s" in found.cause
+
+
+def test_a_prescribed_path_that_ends_is_named_and_not_the_springs_on_it():
+    path = jeuler.PrescribedMotion([0], lambda t: jnp.sqrt(0.35 - t) * jnp.ones((1, 1)))
+    found = lost(jeuler.Scene(SPRING.forces, (path,)), STRETCHED, dt=0.1, num_steps=8)
+    assert (found.step, found.part) == (4, "effects[0] PrescribedMotion")
+    assert "prescribes is not finite at t = 0.4 s" in found.cause
+
+
+def test_a_force_that_is_lost_within_a_step_is_named():
+    def fades(t, position, velocity, mass):
+        return jnp.sqrt(0.25 - t) * jnp.ones_like(position)
+
+    found = lost(jeuler.Scene((fades,)), STRETCHED, dt=0.1, num_steps=5, step=jeuler.rk4_step)
+    assert (found.step, found.part) == (3, "forces[0] fades")
+
+
+def test_a_field_that_an_effect_left_as_nan_is_named_with_the_effect():
+    @jeuler.uses(reads=("heat",))
+    def rise(t, position, velocity, mass, heat):
+        return heat[:, None] * jnp.ones_like(position)
+
+    @jeuler.uses(writes=("heat",))
+    def cool(t, dt, state, key):
+        return state.replace(heat=jnp.sqrt(0.25 - t) * jnp.ones_like(state.heat))
+
+    found = lost(jeuler.Scene((rise,), (cool,)), STRETCHED.replace(heat=jnp.ones(3)), dt=0.1, num_steps=6)
+    assert (found.step, found.part) == (4, "forces[0] rise")
+    assert "the field 'heat', which it reads, is NaN, as cool left it" in found.cause

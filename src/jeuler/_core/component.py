@@ -134,12 +134,20 @@ def _is_number(x: Any) -> bool:
 
 @component(static=("function",))
 class Function:
-    """A plain function in a place where a pytree is expected: all of it is static."""
+    """A plain function, or an object that can be called, where a pytree is expected: all of it is static.
+
+    It has the attributes of what it was made of, the hooks of a component among them.
+    """
 
     function: Any
 
     def __call__(self, *args: Any, **fields: Any) -> Any:
         return self.function(*args, **fields)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or "function" not in self.__dict__:  # copy and pickle ask before there is anything
+            raise AttributeError(name)
+        return getattr(self.function, name)
 
 
 @component(static=("rest",))

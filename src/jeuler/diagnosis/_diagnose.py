@@ -14,9 +14,9 @@ import numpy as np
 from jeuler._core import trees
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler.diagnosis.rerun import Rerun, coincident, largest, lost_particles, springs_among
+from jeuler.diagnosis.rerun import GROWN, Rerun, coincident, largest, lost_particles, springs_among
 from jeuler.particles._simulate import check_kinds
-from jeuler.particles.fields import name_of
+from jeuler.particles.fields import declared, name_of
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, euler_step
@@ -148,16 +148,14 @@ def inside_step(run: Rerun, n: int) -> Diagnosis:
 def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None:
     """Which force, or what else in the motion of step n, is not finite, from the state that it starts from."""
     t, alive = run.time(n), before.alive
-    for part, force in run.shares(t, before):
-        bad = lost_particles(alive, force)
-        if not bad:
-            continue
-        k = index_of(part)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(run.scene.forces[k]):
-            found = before_the_run(f"scene.forces[{k}]{jax.tree_util.keystr(path)}", leaf, ~np.isfinite(leaf))
-            if found:
-                return found
-        return explain(run, "value", n, part, bad, before, springs_among(run.scene.forces[k], before, bad))
+    for effect, t_of_path in run.lost_paths(n, before):
+        cause = f"the motion that it prescribes is not finite at t = {t_of_path:.6g} s"
+        return Diagnosis(False, "value", n, effect, cause=cause, remedy="look at what its path divides by and takes")
+    for t_of_stage, stage in run.stages(n, before):
+        for part, force in run.shares(t_of_stage, stage):
+            bad = lost_particles(alive, force)
+            if bad:
+                return lost_force(run, n, part, bad, stage)
     motion, attributes = (before.position, before.velocity), run.scene.attributes(before)
     bad = lost_particles(alive, run.of_one.equation.vector_field(t, motion, attributes)[1])
     if bad and largest(before.position) < run.huge():
@@ -174,6 +172,24 @@ def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None
             remedy = "take a smaller dt, or implicit_euler(max_steps=..., damped_steps=..., rtol=...)"
             return Diagnosis(False, "value", n, name_of(run.step), bad, cause=cause, remedy=remedy)
     return None
+
+
+def lost_force(run: Rerun, n: int, part: str, bad: tuple[int, ...], at: ParticleState) -> Diagnosis:
+    """Why a force is not finite: a number in it, a field that it reads, or what it makes of them."""
+    k = index_of(part)
+    force = run.scene.forces[k]
+    for path, leaf in jax.tree_util.tree_leaves_with_path(force):
+        found = before_the_run(f"scene.forces[{k}]{jax.tree_util.keystr(path)}", leaf, ~np.isfinite(leaf))
+        if found:
+            return found
+    for field in declared(force, "reads"):
+        value = np.asarray(getattr(at, field))
+        if np.issubdtype(value.dtype, np.floating) and np.isnan(value).any():
+            writers = [e for e in run.scene.effects if field in (*declared(e, "writes"), *declared(e, "sets"))]
+            by = f", as {' or '.join(map(name_of, writers))} left it" if writers else ""
+            cause, remedy = f"the field {field!r}, which it reads, is NaN{by}", f"look at what changes {field!r}"
+            return Diagnosis(False, "value", n, part, bad, cause=cause, remedy=remedy)
+    return explain(run, "value", n, part, bad, at, springs_among(force, at, bad))
 
 
 def lost_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Diagnosis | None:
@@ -227,7 +243,7 @@ def lost_in_step(run: Rerun, n: int, before: ParticleState, cotangent: Any, bad:
             springs = springs_among(run.scene.forces[k], before, who)
             return explain(run, "gradient", n, part, who, before, springs)
     if largest(cotangent) > np.sqrt(run.huge()):
-        limit = run.limit()
+        limit = run.stability_limit(n)
         over = "" if not limit < run.dt else f"; dt is over the stability limit, {limit:.3g} s"
         cause = f"the cotangent grew to {largest(cotangent):.3g} on its way back{over}"
         remedy = "take a shorter horizon or a smaller dt, or cap_cotangent(step, max_norm)"
@@ -252,8 +268,8 @@ def explain(
 ) -> Diagnosis:
     """Why a part gave what is not finite from finite numbers: the step size, their size, or itself."""
     reached, dtype = largest((before.position, before.velocity)), before.position.dtype
-    grown = reached > 1e3 * max(1.0, largest((run.state.position, run.state.velocity)))
-    limit = run.limit() if grown else np.inf
+    grown = reached > GROWN * max(1.0, largest((run.state.position, run.state.velocity)))
+    limit = run.stability_limit(n) if grown else np.inf
     if limit < run.dt:
         times = "dt" if limit == 0 else f"{run.dt / limit:.3g} times the stability limit {limit:.3g} s"
         cause = f"dt = {run.dt:.3g} s is {times} of {name_of(run.step)}"

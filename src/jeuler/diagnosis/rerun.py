@@ -10,16 +10,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler._core import checks, trees
 from jeuler._core.components import stack
 from jeuler.forces import Springs
 from jeuler.particles._simulate import begin, simulate
+from jeuler.particles.equation import Equation
 from jeuler.particles.fields import name_of
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, split_state
 from jeuler.particles.step import SceneStep
 from jeuler.solving._scan import Solution, no_remainder
-from jeuler.steps.explicit import Step
+from jeuler.steps.explicit import Step, is_explicit_of_first_order
 from jeuler.steps.stability import stability_limit
+
+GROWN = 1e3  # times what it was: then a step size may be the cause
+MOST_ROUNDS = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,16 +91,69 @@ class Rerun:
         for share in equation.shares(t, x, v, attributes):
             yield share.name, stack(share.force)
 
-    def limit(self) -> float:
-        """The stability limit at the initial state; inf where it cannot be found. A drag that is limited sets none."""
-        motion = self.state.position, self.state.velocity
-        try:
-            attributes = self.scene.attributes(self.state)
-            return stability_limit(
-                self.scene.without_effects().vector_field, self.of_one.grid.t0, motion, attributes, step=self.step
-            )
-        except ValueError:
-            return np.inf
+    def lost_paths(self, n: int, before: ParticleState) -> Iterator[tuple[str, float]]:
+        """Effects that prescribe what is not finite at the start or the end of step n: name and time."""
+        for k, effect in enumerate(self.scene.effects):
+            if hasattr(effect, "prescribe"):
+                for t in (self.time(n), self.time(n + 1)):
+                    if not trees.all_finite(effect.prescribe(t, before.position.dtype)[1:]):
+                        yield f"effects[{k}] {name_of(effect)}", float(t)
+                        break
+
+    def stages(self, n: int, before: ParticleState) -> Iterator[tuple[Any, ParticleState]]:
+        """The times and states at which the motion of step n evaluates the forces, the first being its start.
+
+        A method that does so in a compiled loop, as Newton's iteration does, shows its start alone.
+        """
+        t, start = self.time(n), (before.position, before.velocity)
+        seen: list[tuple[Any, Any]] = [(t, start)]
+
+        def field(t, motion, attributes):
+            if not any(map(checks.is_traced, jax.tree.leaves((t, motion)))):
+                seen.append((t, motion))
+            return self.of_one.equation.vector_field(t, motion, attributes)
+
+        self.step(field, t, start, self.of_one.grid.dt, self.scene.attributes(before))
+        for t, (position, velocity) in seen:
+            if trees.all_finite((position, velocity)):
+                yield t, dataclasses.replace(before, position=position, velocity=velocity)
+
+    def stability_limit(self, n: int) -> float:
+        """The stability limit where the run begins or, if dt is within that, just before it grew; inf if not found."""
+        limit = self._limit_at(self.of_one.grid.t0, self.state)
+        if limit < self.dt:
+            return limit
+        last = self._before_growth(n)
+        return self._limit_at(self.time(last + 1), self.before(last + 1)) if last else limit
+
+    def _before_growth(self, n: int) -> int:
+        """The last step before step n after which no number is 1,000 times what it was at the start; 0 for none."""
+        arguments = self.arguments | {"save": lambda t, state: _largest_of((state.position, state.velocity))}
+        sizes = np.asarray(simulate(self.scene, self.given, num_steps=n - 1, **arguments).y, float)
+        return int(np.flatnonzero(sizes <= GROWN * max(1.0, sizes[0]))[-1])
+
+    def _limit_at(self, t: Any, state: ParticleState) -> float:
+        """The largest dt whose step, with its limit on drag, is stable: where that limit binds, it depends on dt."""
+        dt, of_one = self.dt, self.of_one
+        for _ in range(MOST_ROUNDS):
+            context = dataclasses.replace(of_one.equation.context, dt=jnp.asarray(dt))
+
+            def field(t, motion, attributes, context=context):
+                of_this = dataclasses.replace(context, particles=len(motion[0]), dtype=motion[0].dtype)
+                return Equation.of(self.scene.forces, self.scene.effects, of_this).vector_field(t, motion, attributes)
+
+            try:
+                motion, attributes = (state.position, state.velocity), self.scene.attributes(state)
+                limit = float(stability_limit(field, t, motion, attributes, step=self.step))
+            except ValueError:
+                return np.inf
+            limited = is_explicit_of_first_order(self.step) and any(hasattr(f, "drag") for f in self.scene.forces)
+            if not limited or limit == 0 or dt == self.dt <= limit:
+                return limit
+            if limit >= dt * (1 - 1e-3):
+                return dt
+            dt = limit
+        return dt
 
     def huge(self) -> float:
         return float(jnp.finfo(self.state.position.dtype).max) ** 0.75
@@ -126,6 +184,11 @@ def coincident(position: jax.Array, among: tuple[int, ...]) -> str:
         if same:
             return f", where particles {min(a, same[0])} and {max(a, same[0])} coincide"
     return ""
+
+
+def _largest_of(y: Any) -> jax.Array:
+    """The largest absolute value in a pytree, as part of a run."""
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0) for leaf in jax.tree.leaves(y)]))
 
 
 def largest(y: Any) -> float:

@@ -164,7 +164,14 @@ class SceneStep:
 def with_its_needs(effect: Any, key: Array | None, n: Any, t0: Array) -> Callable[..., Any]:
     """The effect as ``effect(t, dt, previous, state)``, with its key and, if it needs it, the clock."""
     clock = {"clock": (n, t0)} if needs(effect, "clock") else {}
-    return functools.partial(with_previous(effect, ""), key=key, **clock)
+    act = functools.partial(with_previous(effect, ""), key=key, **clock)
+
+    def with_counter(t: Any, dt: Any, previous: ParticleState, state: ParticleState) -> Any:
+        after = act(t, dt, previous, state)
+        forgotten = isinstance(after, ParticleState) and after.steps is None and state.steps is not None
+        return replace(after, steps=state.steps) if forgotten else after  # a state made anew knows nothing of the run
+
+    return with_counter
 
 
 @dataclasses.dataclass(frozen=True)
