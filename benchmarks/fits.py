@@ -4,6 +4,7 @@
     python benchmarks/fits.py chain [N ...]        time from data to answer of a chain of N masses, N + 1 springs
     python benchmarks/fits.py coverage             how often nominal 95 % intervals hold the truth, 500 records each
     python benchmarks/fits.py starts [cases]       one oscillator, starts wrong by up to 100, and aliased tenfold
+    python benchmarks/fits.py net_starts [cases]   a net of 5 by 5, the same
 
 Data are made by diffrax's Tsit5 at 1e-9, or exactly; the fit runs RK4. mujoco.sysid is left out where it is not there.
 """
@@ -139,7 +140,45 @@ def starts(cases=100):
     print(dict(counted))
 
 
+def net_starts(cases=100):
+    """A hanging net of 5 by 5 with 36 springs: starts wrong by up to 100, from the data and from the given values."""
+    random, counted = np.random.default_rng(11), collections.Counter()
+    i = np.arange(25).reshape(5, 5)
+    edges = np.concatenate(
+        [np.stack([i[:, :-1], i[:, 1:]], -1).reshape(-1, 2), np.stack([i[:-1], i[1:]], -1).reshape(-1, 2)]
+    )
+    x = np.stack([i.ravel() % 5, -(i.ravel() // 5), 0 * i.ravel()], axis=1).astype(float)
+    mass = np.where(np.arange(25) < 5, np.inf, 1.0)
+    edges = edges[(edges >= 5).any(axis=1)]
+    for case in range(cases):
+        ks, kd = 100 * 10 ** random.uniform(-0.5, 0.5, 36), 10 ** random.uniform(-1, 0, 36)
+        v = np.where(np.isinf(mass)[:, None], 0, random.normal(size=x.shape))
+        aliased, start = case % 4 == 3, ("data", "given")[case % 2]
+        t = np.arange(51) * (0.5 if aliased else 0.04)  # about 20 samples a period of the fastest mode, or 2
+        truth = jeuler.Scene((jeuler.Springs(edges, ks, kd, 1.0), jeuler.Gravity([0.0, -9.81, 0.0])))
+        noise = 10 ** random.uniform(-4, -2.5)
+        y = made(truth, x, v, mass, t) + noise * random.normal(size=(51, 25, 3))
+        factor = random.choice([0.01, 1 / 30, 0.1, 1 / 3, 1, 3, 10, 30, 100])
+        scene = jeuler.Scene(
+            (jeuler.Springs(edges, np.full(36, 100.0) * factor, np.full(36, 0.3), 1.0), truth.forces[1])
+        )
+        state, dt = jeuler.ParticleState(x, v, mass), 0.01 if not aliased else 0.025
+        try:
+            found = jeuler.fit_springs(scene, state, t, y, dt=dt, start=start, max_iterations=60, progress=False)
+        except ValueError as error:
+            counted[f"{start}, {'aliased, ' if aliased else ''}said ({str(error)[:40]})"] += 1
+            continue
+        off, error = np.abs(np.asarray(found.ks) - ks), np.asarray(found.stderr["ks"])
+        right = np.mean((off < 0.02 * ks) | (off < 4 * error)) > 0.97
+        verdict = "right" if right else "said" if found.message != "converged" else "SILENT"
+        counted[f"{start}, {'aliased, ' if aliased else ''}{verdict}"] += 1
+        print(case, start, f"{factor:.3g}", aliased, verdict, found.message[:200], flush=True)
+    print(dict(counted))
+
+
 if __name__ == "__main__":
     what, *numbers = sys.argv[1:] or ["net"]
     for number in numbers or [None]:
-        {"net": net, "chain": chain, "coverage": coverage, "starts": starts}[what](*([int(number)] if number else []))
+        {"net": net, "chain": chain, "coverage": coverage, "starts": starts, "net_starts": net_starts}[what](
+            *([int(number)] if number else [])
+        )

@@ -159,6 +159,14 @@ BAD_SPRINGS = {
     "iterations": ({"max_iterations": 0}, "max_iterations must be at least 1"),
     "optimizer": ({"optimizer": "adam"}, "optimizer must be an optax optimiser"),
     "starts": ({"starts": 0}, "starts must be at least 1"),
+    "starts word": ({"starts": "many"}, "starts must be a number of starts, or a tree like params.*write starts=64"),
+    "starts of one": ({"starts": {"ks": np.ones(3)}}, "starts must be a number of starts, or a tree like params"),
+    "starts uneven": ({"starts": {"ks": np.ones(3), "kd": np.ones(2)}}, "one row a start"),
+    "num_steps": ({"num_steps": 3}, "num_steps=250 reaches it"),
+    "over span": ({"dt": 30.0}, "dt must be at most the span of the times"),
+    "t0": ({"t0": 1.0}, "pass t0, the time of the state, or drop the rows before it"),
+    "falling": ({"times": T[::-1]}, "times must not decrease.*sort the rows"),
+    "flat": ({"positions": SWING}, r"positions must have shape \(time, particle, dim\)"),
     "resume folder": ({"resume": "/nowhere/at/all"}, "there is no folder"),
     "times repeat": ({"times": np.zeros(101)}, "times must .* two different times"),
     "too few": ({"times": T[:1], "positions": seen()[:1]}, "times must .* two different times"),
@@ -189,8 +197,13 @@ def test_bad_input_of_fit_springs(name):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"parameters": ("ks", "kd", "mass")}, "kd, ks and mass only as their ratios"),
-        ({"positions": seen(1000 * SWING)}, "explains only|times the noise"),
+        ({"parameters": ("ks", "kd", "mass")}, "kd, ks and mass only as their ratios; hold some of it, or record"),
+        (
+            {"positions": seen(1000 * SWING)},
+            "explains only.*begin 1.3e\\+03 m from where the state is: give both in one",
+        ),
+        ({"positions": seen(SWING - 1)}, "begin 1 m from where the state is.*from one origin"),
+        ({"scene": jeuler.Scene((jeuler.Springs([[0, 1]], 80.0, 0.2, 1000.0),))}, "rest_length is 1e\\+03 m where the"),
         ({"bounds": {"ks": (0.0, 90.0)}}, "ks ended on a bound"),
         ({"times": T[:3], "positions": seen()[:3]}, "do not determine|not told apart|there are only"),
     ],
@@ -199,5 +212,6 @@ def test_doubtful_input_gets_its_word(change, words):
     import re
 
     arguments = {"times": T, "positions": seen(), "dt": 0.02, **change}
-    found = jeuler.fit_springs(scene(), STATE, arguments.pop("times"), arguments.pop("positions"), **arguments)
+    given, times = arguments.pop("scene", scene()), arguments.pop("times")
+    found = jeuler.fit_springs(given, STATE, times, arguments.pop("positions"), **arguments)
     assert re.search(words, found.message), found.message

@@ -13,6 +13,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler.fitting.engine import Outcome, run
 from jeuler.fitting.forward import Forward
+from jeuler.fitting.mismatch import mismatched
 from jeuler.fitting.observations import (
     amplitude_of,
     checked_observations,
@@ -34,6 +35,7 @@ from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step
 
+POOR = 0.9  # share explained below which units and origins are looked at
 GOOD = 1.5  # times the noise: a residual below this leaves nothing to look for elsewhere
 
 
@@ -224,6 +226,8 @@ class Recorded:
             forward = Forward.of(self.prediction, layout, data)
             predicted = jnp.asarray(forward.positions(layout.vector(found.params), data), self.state.position.dtype)
         words = aliased(self.scene, scene, state, self.times)
+        if found.explained is not None and found.explained < POOR:
+            words += mismatched(self.scene, self.state, self.times, self.targets, self.t0)
         if step_bias and found.covariance is not None and outcome.state is not None:
             bias, more = bias_of_step(self, found, outcome.state)
             words = [*words, *more]

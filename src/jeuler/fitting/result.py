@@ -143,7 +143,7 @@ class Verdict:
         if self.nonfinite:
             parts.append(f"stepped back from {self.nonfinite} points that were not finite")
         if self.blind:
-            parts.append("the data do not determine " + _some(self.blind, 6))
+            parts.append(f"the data do not determine {_some(self.blind, 6)}; hold some of it, or record what shows it")
         if self.at_bound:
             parts.append(f"{_some(self.at_bound, 4)} ended on a bound")
         if self.unresolved:

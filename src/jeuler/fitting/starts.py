@@ -28,7 +28,7 @@ def best_start(
     if isinstance(options.starts, (int, np.integer)) and not isinstance(options.starts, bool):
         xs = drawn_starts(checks.count("starts", options.starts, least=1), x, task, evaluate)
     else:
-        count = len(jax.tree.leaves(options.starts)[0])
+        count = _count_of(options.starts, layout)
         xs = np.stack(
             [np.asarray(layout.vector(jax.tree.map(lambda a, k=k: a[k], options.starts)), float) for k in range(count)]
         )
@@ -49,6 +49,19 @@ def best_start(
         raise ValueError(NOT_FINITE)
     every = jax.tree.map(lambda *a: jnp.stack(a), *[layout.params(jnp.asarray(s.x)) for s in states])
     return states[int(np.nanargmin(losses))].x, {"params": every, "loss": losses}
+
+
+def _count_of(starts: Any, layout: Any) -> int:
+    """How many starts a tree of them holds, or one ValueError."""
+    leaves, structure = jax.tree.flatten(starts)
+    shapes = [np.shape(leaf) for leaf in leaves]
+    counts = {shape[0] if shape else 0 for shape in shapes}
+    if structure != layout.structure or len(counts) != 1 or not min(counts):
+        raise ValueError(
+            f"starts must be a number of starts, or a tree like params whose arrays have one more axis in front, one "
+            f"row a start, got {checks.shown(starts)}; write starts=64"
+        )
+    return int(min(counts))
 
 
 def drawn_starts(count: int, x: np.ndarray, task: Task, evaluate: Any) -> np.ndarray:
