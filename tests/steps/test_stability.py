@@ -223,6 +223,9 @@ def test_a_net_in_a_part_of_its_space_has_the_limit_of_the_whole(step):
         small = reduced_pair(product, flat.size, symmetric_weights(product, flat.size, args.mass))
         part = linear.limit_of(Spectrum.of(small.matrix, small.like, linear.neutral), step, "unstable")
         checked = linear.bisected(lambda dt: dt > whole, Runs(linear.field, step, linear.y, 1.0), part, 10.0)
+    k = len(small.matrix) // 2
+    for block in (small.matrix[k:, :k], small.matrix[k:, k:]):  # also beside a pinned particle and unequal masses
+        np.testing.assert_allclose(block, block.T, atol=1e-9 * np.abs(block).max())
     assert part == pytest.approx(whole, rel=1e-3)
     assert checked == pytest.approx(whole, rel=0.02)
 

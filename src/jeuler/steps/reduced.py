@@ -20,6 +20,7 @@ from jeuler.steps.explicit import Step
 MOST = 64  # dimension of the Krylov space
 MOST_WHOLE = 192  # where all that is asked of it is its eigenvalues, up to
 MANY = 20_000  # numbers in the state
+LEAST = 6  # runs, however slow the machine
 SEGMENTS = 4  # of a run, compared with each other
 
 
@@ -62,16 +63,17 @@ def reduced_pair(product: Callable[..., Any], n: int, weights: np.ndarray) -> Re
     """A pair (position, velocity) of equal halves, both in the space of the fastest of K + s C.
 
     x' = v, v' = -K x - C v;  in the coordinates sqrt(m) x K and C of springs are symmetric, and so they stay.
-    weights: the square roots of the masses, or ones, (n / 2,).
+    weights: the square roots of the masses, or ones, (n / 2,); 0 for what is pinned, which stays out.
     """
     half = n // 2
+    inverse = np.divide(1.0, weights, out=np.zeros(half), where=weights > 0)
 
     def slope(x, v):
-        image = product(np.concatenate([x / weights, v / weights]))
+        image = product(np.concatenate([x * inverse, v * inverse]))
         return image[:half] * weights, image[half:] * weights
 
     still = np.zeros(half)
-    start = np.random.default_rng(0).standard_normal(half)
+    start = np.random.default_rng(0).standard_normal(half) * (weights > 0)
     direction, rate = start / np.linalg.norm(start), 1.0
     for _ in range(8):
         direction = slope(direction, still)[1]
@@ -94,7 +96,7 @@ def reduced_pair(product: Callable[..., Any], n: int, weights: np.ndarray) -> Re
     columns = [np.concatenate([basis.T @ dx, basis.T @ dv]) for dx, dv in (*of_position, *of_velocity)]
     k = basis.shape[1]
     like = jnp.zeros(k), jnp.zeros(k)
-    lift = lambda z: np.concatenate([basis @ z[:k] / weights, basis @ z[k:] / weights])  # noqa: E731
+    lift = lambda z: np.concatenate([basis @ z[:k] * inverse, basis @ z[k:] * inverse])  # noqa: E731
     return Reduced(np.stack(columns, axis=1), like, lift)
 
 
@@ -106,20 +108,25 @@ def reduced_whole(product: Callable[..., Any], n: int) -> Reduced:
 
 
 def symmetric_weights(product: Callable[..., Any], n: int, masses: Any) -> np.ndarray:
-    """Square roots of the masses, one a number of the position, where they make K symmetric; ones where not."""
-    half, ones = n // 2, np.ones(n // 2)
+    """Square roots of the masses, one a number of the position, where they make K symmetric; ones where not.
+
+    0 for what is pinned: it moves others where it is moved, but nothing moves it.
+    """
+    half = n // 2
     mass = np.asarray(masses, dtype=float).ravel() if masses is not None else np.ones(0)
     if not mass.size or half % mass.size or not np.all(mass > 0):
-        return ones
-    weights = np.sqrt(np.repeat(np.where(np.isfinite(mass), mass, 1.0), half // mass.size))
+        return np.ones(half)
+    mass = np.repeat(mass, half // mass.size)
+    free = np.isfinite(mass)
+    weights = np.sqrt(np.where(free, mass, 1.0))
     random = np.random.default_rng(1)
-    a, b = random.standard_normal((2, half))
+    a, b = random.standard_normal((2, half)) * free
 
     def image(u):
         return weights * product(np.concatenate([u / weights, np.zeros(half)]))[half:]
 
     ab, ba = float(a @ image(b)), float(b @ image(a))
-    return weights if abs(ab - ba) <= 1e-6 * max(abs(ab), abs(ba)) else ones
+    return free * (weights if abs(ab - ba) <= 1e-6 * max(abs(ab), abs(ba)) else 1.0)
 
 
 class Runs:
@@ -129,6 +136,7 @@ class Runs:
     seconds: float
     begun: float
     length: int
+    count: int
 
     def __init__(self, field: Callable[..., Any], step: Step, like: Any, seconds: float) -> None:
         unflatten = trees.real_vector(like)[1]
@@ -154,11 +162,11 @@ class Runs:
             return lax.scan(segment, (u / jnp.linalg.norm(u), 0.0), None, length=SEGMENTS)[1]
 
         self.run, self.seconds, self.begun = run, seconds, math.inf
-        self.length = 0
+        self.length = self.count = 0
 
     @property
     def late(self) -> bool:
-        return time.perf_counter() - self.begun > self.seconds
+        return self.count >= LEAST and time.perf_counter() - self.begun > self.seconds
 
     def grows(self, t: Any, flat: Any, u: np.ndarray, dt: float) -> bool:
         """Whether a perturbation u grows without bound: by the same factor, again and again."""
@@ -170,6 +178,7 @@ class Runs:
             each = (time.perf_counter() - self.begun) / 5 / SEGMENTS
             self.length = int(np.clip(self.seconds / 8 / each / SEGMENTS, 50, 500))
         peaks = np.asarray(run(self.length))
+        self.count += 1
         rise = np.diff(peaks)
         # a drift, or slow modes that begin to swing, grow as a power of time: by less, from segment to segment
         return not np.all(np.isfinite(peaks)) or bool(rise[-1] > 0.7 and rise[-1] >= 0.85 * rise[-2])
