@@ -47,6 +47,7 @@ class Contacts:
         self.listed = jnp.ones(len(self.i), bool)
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
+        self.resting: Array | bool = False  # (contact,), which are held from the start of the step
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         sizes = ("particles", "dim")
@@ -101,6 +102,11 @@ class Contacts:
         """What the first partner of each contact has of y, (particle, ...)."""
         return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i]] if len(self.i) else [])])
 
+    def second(self, y: Array) -> Array:
+        """What the second partner of each contact has of y; 0 for a collider."""
+        walls = jnp.zeros((self.walls, *y.shape[1:]), y.dtype)
+        return jnp.concatenate([walls, y[self.j]]) if len(self.j) else walls
+
     def relative(self, y: Array) -> Array:
         """y of the first partner less that of the second; of a particle at a collider just y."""
         return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i] - y[self.j]] if len(self.i) else [])])
@@ -108,6 +114,15 @@ class Contacts:
     def both(self, join: Callable[[Array, Array], Array], y: Array) -> Array:
         """join(y of the first, y of the second), where there is no second y of the first; y is (particle,)."""
         return jnp.concatenate([*[y] * len(self.colliders), *([join(y[self.i], y[self.j])] if len(self.i) else [])])
+
+    def gather(self, first: Array, second: Array) -> Array:
+        """The sums (particle, ...) of what contacts add to the first and take from the second partner."""
+        total = jnp.zeros((self.particles, *first.shape[1:]), first.dtype)
+        for k in range(len(self.colliders)):
+            total = total + first[k * self.particles : (k + 1) * self.particles]
+        if len(self.i):
+            total = total.at[self.i].add(first[self.walls :]).at[self.j].add(-second[self.walls :])
+        return total
 
     def move(self, change: Array) -> Array:
         """The changes (particle, ...) by impulses that change the relative velocity by (contact, ...) if alone."""

@@ -16,11 +16,12 @@ from jax import Array, lax
 from jeuler._core.vectors import length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
-from jeuler.contact.contacts import Contacts, Look
+from jeuler.contact.contacts import TOUCH, Contacts, Look
 from jeuler.contact.paths import Path, along
 
 MAX_STRIDES = 400  # along one path; one that grazes a surface that is not known to be convex needs many
-NEWTON_STEPS = 5
+NEWTON_STEPS = 12
+GRAZING = 4  # square roots of a unit in the last place: an approach in parts of the speed that rounding can make or end
 
 
 class Events(NamedTuple):
@@ -38,7 +39,7 @@ class Found(NamedTuple):
     s: Array  # (contact,), inf for none
     at_root: Array
     plastic: Array
-    given_up: Array  # whether the search ended before it was clear
+    unclear: Array  # whether the search was given up, or found a path that grazes within rounding: no time of impact
     look: Look  # at s
 
 
@@ -56,13 +57,16 @@ def bounce(v: Array, normal: Array, restitution: Any, friction: Any) -> Array:
     return push[..., None] * normal - lost[..., None] * v_t
 
 
+def rounding_of_speed(contacts: Contacts, path: Path) -> Array:
+    """What a speed of approach of 0 may look like, m a step."""
+    eps = jnp.finfo(path.x.dtype).eps
+    return contacts.both(jnp.add, 4 * eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1)))
+
+
 def impulsive_limit(contacts: Contacts, normal: Array, path: Path) -> Array:
     """The speed of approach, m a step, up to which an impact is one that the step itself can make: it is plastic."""
-    eps = jnp.finfo(path.x.dtype).eps
-    bend = contacts.relative(path.bend)
-    made = jnp.abs(jnp.sum(bend * normal, axis=-1))
-    rounding = contacts.both(jnp.add, 4 * eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1)))
-    return 1.001 * made + rounding
+    made = jnp.abs(jnp.sum(contacts.relative(path.bend) * normal, axis=-1))
+    return 1.001 * made + rounding_of_speed(contacts, path)
 
 
 def convex_stride(gap: Array, slope: Array, bend: Array) -> Array:
@@ -89,7 +93,8 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     first = contacts.look(path, start)
     limit = impulsive_limit(contacts, first.normal, path) + slow
     touching = first.gap <= small
-    now = touching & (-first.slope > limit)
+    rests = contacts.resting & ~contacts.both(jnp.logical_or, path.hit)  # still as it was held from the start
+    now = touching & (-first.slope > jnp.where(rests, limit, rounding_of_speed(contacts, path) + slow))
     lowest = jnp.where(now, start - 1, start)
     turn = length(contacts.relative(path.bend))
     fastest = length(first.speed) + turn
@@ -106,14 +111,15 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
         s, look, apart, newtons, n = state
         gap, slope = look.gap, look.slope
         far = apart & ((gap > 1e-3 * stride) | (slope >= 0)) & (gap > 0) & (newtons == 0)
-        ahead = jnp.maximum(gap / safe_stride, jnp.where(slope >= 0, 0.02, 0))  # away from it not too slowly
         longer = convex_stride(jnp.maximum(gap, 0), slope, turn)
-        ahead = jnp.minimum(jnp.where(convex, jnp.maximum(ahead, longer), ahead), 2)
+        not_too_slow = jnp.where(slope >= 0, jnp.minimum(0.02, longer), 0)  # away from a surface of any form
+        ahead = jnp.minimum(jnp.maximum(gap / safe_stride, jnp.where(convex, longer, not_too_slow)), 2)
         falls = slope < 0
         root = jnp.clip(s - gap / jnp.where(falls, slope, -1), lowest, 2)
         s = jnp.where(n == 0, s, jnp.where(far, s + ahead, jnp.where(falls, root, s)))
         newtons = newtons + jnp.where((n > 0) & ~far, 1, 0)
         look = contacts.look(path, s)
+        newtons = jnp.where((newtons > 0) & (jnp.abs(look.gap) <= small / TOUCH), NEWTON_STEPS, newtons)
         apart = jnp.where(n == 0, ~now & (look.gap > small), apart)
         return s, look, apart, jnp.where(now | apart, newtons, NEWTON_STEPS), n + 1
 
@@ -121,12 +127,14 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     state = begin, first, now, jnp.zeros(contacts.count, jnp.int32), 0
     s, look, apart, newtons, _ = lax.while_loop(go_on, advance, state)
     given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
-    at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small + 1e-6 * stride) & (s > lowest)
+    at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small - 1e-6 * look.slope) & (s > lowest)
     happens = searched & (now | (apart & at_root & (s <= 1)))
     overlap = now & ~at_root
     look = jax.tree.map(lambda x, y: jnp.where(overlap if x.ndim == 1 else overlap[:, None], x, y), first, look)
     s = jnp.where(overlap, start, s)
-    return Found(jnp.where(happens, s, jnp.inf), at_root, ~now & (-look.slope <= limit), given_up, look)
+    glancing = GRAZING * jnp.sqrt(jnp.finfo(s.dtype).eps) * length(first.speed)
+    grazes = happens & ~now & (-look.slope <= glancing) & (jnp.arange(contacts.count) >= contacts.walls)
+    return Found(jnp.where(happens, s, jnp.inf), at_root, -look.slope <= limit, given_up | grazes, look)
 
 
 def choose(contacts: Contacts, found: Found) -> Events:
@@ -186,8 +194,9 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     into = jnp.sum(bend * normal, axis=-1)
     held = jnp.where(plastic & (into < 0), -into, 0)[:, None] * normal  # no more push into what it stays on
 
-    both = contacts.move(jnp.where(now[:, None], jnp.concatenate([change, held], axis=1), 0))
-    kick, hold = both[:, : contacts.dim], both[:, contacts.dim :]
+    zero = jnp.zeros_like(change)
+    kick = contacts.move(jnp.where(now[:, None], change, zero))
+    hold = shared(contacts, path, normal, jnp.where(now[:, None], held, zero))
     own_s = spread(contacts, path.s, s, now)
     hit = (events.contact >= 0)[:, None]
     late = (1 - own_s)[:, None] + 0.5 - theta
@@ -203,6 +212,23 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
         path.support + hold,
         jnp.where(jnp.any(hold != 0, axis=-1), along(speed, path.support + hold), path.ride),
     )
+
+
+def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Array:
+    """What of a change of the relative bend, (contact, dim), falls to each particle, (particle, dim).
+
+    By the masses; who would be pushed against what holds it is held, and the other partner takes all.
+    """
+
+    def free(support, towards):
+        return jnp.sum(support * towards, axis=-1) >= -0.5 * length(support)
+
+    first, second = contacts.first(contacts.inverse_mass), contacts.second(contacts.inverse_mass)
+    first = jnp.where(free(contacts.first(path.support), normal), first, 0)
+    second = jnp.where(free(contacts.second(path.support), -normal), second, 0)
+    both = first + second
+    change = change * jnp.where(both > 0, 1 / jnp.where(both > 0, both, 1), 0)[:, None]
+    return contacts.gather(first[:, None] * change, second[:, None] * change)
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:
@@ -240,7 +266,7 @@ def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: 
         events = events._replace(plastic=events.plastic | (k == rounds))
         any_left = jnp.any(events.contact >= 0)
         stopped = (k == rounds) & jnp.isfinite(found.s) & ~found.plastic
-        left = left + jnp.sum(found.given_up | stopped).astype(jnp.int32)
+        left = left + jnp.sum(found.unclear | stopped).astype(jnp.int32)
         record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)
         path = strike(contacts, path, events, found.s, found.look, theta)
         return path, record, k + 1, any_left, left

@@ -98,18 +98,24 @@ def at_rest(problem: Problem, small: Array) -> Rest:
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
-    def acting(w, kick):
-        return lax.stop_gradient(active & ((problem.push(w) > 0) | (problem.gap_after(kick) < -small)))
+    def acting(w, change):  # one of push and parts is 0, or a rounding; or several contacts could hold it
+        parts = problem.push(problem.velocity + change)
+        weak = 1e-4 * jnp.max(length(problem.velocity), initial=0)
+        return lax.stop_gradient(active & (problem.push(w) > parts + weak))
+
+    def overlaps(kick):
+        return lax.stop_gradient(active & (problem.gap_after(kick) < -small))
 
     if len(contacts.colliders) == 1 and not len(contacts.i):  # each particle for itself: exact at once
         w = problem.project(-problem.velocity)
-        on, unresolved = acting(w, w), jnp.int32(0)
+        on, unresolved = acting(w, w) | overlaps(w), jnp.int32(0)
         u = jnp.concatenate([w, jnp.where(on, -problem.gap_after(w), 0)[:, None]], axis=1)
     else:
         rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, active))
         w, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate, small), REST)
         unresolved = jnp.sum(active & (error > _tolerated(problem) + small)).astype(jnp.int32)
-        on = acting(w, contacts.move(w))
+        kick = contacts.move(w)
+        on = acting(w, contacts.relative(kick)) | overlaps(kick)
         u = _solve(lambda u: problem.residual(u, rate, on), jnp.pad(w, ((0, 0), (0, 1))), anywhere(active))
     kick, q = contacts.move(u[:, :-1]), u[:, -1]
     gap = problem.gap_after(kick) + problem.along(problem.shift(q))

@@ -95,7 +95,8 @@ def hold(
     rest = at_rest(Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays), small)
     overlaps = jnp.sum(rest.on & (rest.gap < -small - 1e-6 * contacts.both(jnp.add, contacts.radius)))
     unresolved = rest.unresolved + overlaps.astype(jnp.int32)
-    touched = _touched(contacts, rest.on)
+    touched = _touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1)
+    contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
     path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.kick)
     lost = _touched(contacts, jnp.isnan(gap) & (jnp.arange(contacts.count) < contacts.walls)) & contacts.alive
