@@ -161,6 +161,19 @@ WRONG = {  # what a person wrote: a part of the one line that comes back
     "a solver in words": (lambda: jeuler.implicit_euler(linear_solver="LU"), "lineax.LU()"),
     "an optimiser in words": (lambda: jeuler.fit(lambda p: p["a"], {"a": 1.0}, optimizer="adam"), "such as optax.adam"),
     "no residual": (lambda: jeuler.fit(None, {"a": 1.0}), "residual must be a function"),
+    "a step longer than the recording": (
+        lambda: jeuler.fit_springs(
+            NET, PAIR, np.linspace(0.0, 1.0, 5), np.random.default_rng(0).random((5, 2, 2)), dt=2.0
+        ),
+        "dt must be at most the span of the times, 1 s from t0=0 s, got 2 s",
+    ),
+    "a column of wind": (
+        lambda: simulate(Scene((LinearDrag(1.0, air=jeuler.Wind([[1.0], [0.0]])),))),
+        r"Wind.velocity must have shape \(dim,\), got shape \(2, 1\)",
+    ),
+    "None for a number": (lambda: Cone([0.0, 1.0], 1.0, None), "Cone.angle must be a number"),
+    "a pool of no mass": (lambda: jeuler.empty_pool(3, 2, mass=0.0), "state.mass must be greater than 0 kg"),
+    "a callback": (lambda: simulate(callback=print), "progress=lambda step, num_steps: ... for how far it is"),
     "no path": (lambda: jeuler.read_trajectory(3), "a recording is a path, an open file"),
     "names as one string": (lambda: jeuler.uses(reads="temperature"), "uses.reads must be a tuple of names"),
 }

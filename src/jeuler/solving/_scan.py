@@ -34,7 +34,7 @@ INSTEAD = {
     "solver": "step=jeuler.rk4_step",
     "saveat": "save_every=...",
     "ts": "save_every=...",
-    "callback": "save=lambda t, y: ...",
+    "callback": "save=lambda t, y: ... for what is kept, progress=lambda step, num_steps: ... for how far it is",
     "mass": "args=mass",
     "rng": "key=jax.random.key(0)",
     "seed": "key=jax.random.key(0)",
