@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jeuler
-from jeuler.effects.lifecycle import births_of_stream
+from jeuler.effects.births import births_of_stream
 from jeuler.solving.grid import Grid
 
 KEY = jax.random.key(0)

@@ -1,3 +1,3 @@
-"""Checks, pytrees and vectors: imports JAX and NumPy, nothing of ours."""
+"""Checks, pytrees and vectors: imports JAX and NumPy, and no other package of jeuler."""
 
-"""Checks, pytrees and vectors: imports JAX and NumPy, nothing of ours."""
+"""Checks, pytrees and vectors: imports JAX and NumPy, and no other package of jeuler."""

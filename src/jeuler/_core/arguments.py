@@ -86,7 +86,7 @@ def _meant(key: str, names: tuple[str, ...], instead: dict[str, str]) -> str:
 
 
 def near_name(name: str, names: Any, cutoff: float = 0.65) -> str | None:
-    """The one of the names that a person who wrote ``name`` is likely to have meant."""
+    """The name that a user who wrote ``name`` is likely to have meant; None if none is near."""
     for other in names:
         if sorted(name) == sorted(other):  # letters swapped, which in short names are much of the name
             return other

@@ -30,7 +30,7 @@ def with_previous(effect: Callable[..., Any], name: str) -> Callable[..., Any]:
 
     ValueError where it takes neither.
     """
-    if hasattr(effect, "over_step"):  # what effects of the person's own had for this before `previous`
+    if hasattr(effect, "over_step"):  # what effects of the user's own had for this before `previous`
         return effect.over_step
     signature = checks.signature_of(unwrapped(effect))
     if signature is None or "previous" in signature.parameters or not _takes(signature, 4):

@@ -1,4 +1,4 @@
-"""Checks of what a person passed: one clear ValueError each, at call time, before anything is traced.
+"""Checks of what the user passed: one clear ValueError each, at call time, before anything is traced.
 
 Values that are being traced cannot be looked at, so value checks pass over them; types and shapes are always seen.
 """
@@ -97,7 +97,7 @@ def shape(name: str, came: tuple[int, ...], *expected: tuple[int, ...], meaning:
 
 
 def integers(name: str, came: Any, meaning: str) -> np.ndarray:
-    """came as an array of the indices that it is, each from 0 to 2^31 - 1; nothing is rounded, nothing wraps."""
+    """``came`` as an integer array of indices from 0 to 2^31 - 1; nothing is rounded or wrapped."""
     expected = f"{name} must be {meaning}"
     if any(map(is_traced, jax.tree.leaves(came))):
         raise ValueError(
@@ -121,7 +121,7 @@ def integers(name: str, came: Any, meaning: str) -> np.ndarray:
 
 
 def different(name: str, came: np.ndarray, kind: str) -> None:
-    """No row of these indices names one twice."""
+    """No row of these indices holds the same one twice."""
     rows = np.sort(np.atleast_2d(came), axis=1)
     wrong = np.flatnonzero((rows[:, 1:] == rows[:, :-1]).any(axis=1))
     if wrong.size:
@@ -251,7 +251,7 @@ def count(name: str, x: Any, *, least: int = 0) -> int:
 
 
 def refuse_class(expected: str, x: Any) -> None:
-    """x is a thing, not the class of such things; ``expected`` begins the message."""
+    """x is an object, not its class; ``expected`` begins the message."""
     if isinstance(x, type):
         raise ValueError(f"{expected}, got the class {x.__name__}; make one, {x.__name__}(...)")
 
@@ -275,7 +275,7 @@ def function(name: str, f: Any, form: str, hint: str) -> None:
 
 
 def signature_of(f: Any) -> inspect.Signature | None:
-    """The arguments of f; None for what does not say, such as some functions built into Python."""
+    """The signature of f; None where Python does not know it, as of some built-in functions."""
     try:
         return inspect.signature(f)
     except (TypeError, ValueError):
@@ -295,7 +295,7 @@ def random_key(key: Any) -> None:
 
 
 def path_name(path: tuple[Any, ...]) -> str:
-    """A leaf's place in a pytree, to be read by a person."""
+    """The path of a leaf in a pytree, written for people."""
     return jax.tree_util.keystr(path) or "y"
 
 
@@ -321,7 +321,7 @@ def state(name: str, y: Any) -> Any:
 
 
 def form_of(what: str, function: Any, *arguments: Any) -> Any:
-    """Shapes and dtypes of what a person's function returns; one ValueError where it cannot be traced."""
+    """Shapes and dtypes of what the user's function returns; one ValueError where it cannot be traced."""
     try:
         return jax.eval_shape(function, *arguments)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:

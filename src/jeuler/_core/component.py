@@ -29,7 +29,7 @@ def component(
     """Make a class a frozen dataclass that is also a pytree.
 
     Fields named in ``static`` are part of the structure (hashable, fixed while tracing), all others are
-    children. Unflattening does not call ``__init__``, so a ``__post_init__`` sees what a person passed and never a
+    children. Unflattening does not call ``__init__``, so a ``__post_init__`` sees what the user passed and never a
     transformation's placeholder. What a fit may vary are the ``parameters``, None: all that are not static; those that
     are ``positive`` are never below 0. `parameters_of` reads these two.
     """
@@ -117,7 +117,7 @@ def parameters_of(part: Any) -> dict[str, bool]:
     """The fields of a component that a fit may vary, by name, with whether each is positive by its meaning.
 
     Only fields that hold numbers now: not an air, a collider or a function of time, and not None.
-    A dataclass of the person's own that does not say which has all its fields that hold floating numbers.
+    A dataclass of the user's own that does not say which has all its fields that hold floating numbers.
     """
     part = part.whole() if isinstance(part, Partitioned) else part
     kind = type(part)
@@ -193,5 +193,5 @@ def as_component(x: Any) -> Any:
 
 
 def unwrapped(x: Any) -> Any:
-    """What a person passed in place of a component."""
+    """What the user passed in place of a component."""
     return x.function if isinstance(x, Function) else x.whole() if isinstance(x, Partitioned) else x

@@ -1,4 +1,4 @@
-"""How an object shows itself: on one screen of a terminal, and as a table in a notebook."""
+"""How objects are displayed: on one screen of a terminal, and as a table in a notebook."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Part = str | tuple[str, list["Part"], str]  # a text, or what opens, the parts w
 
 
 def summary(x: Any) -> str:
-    """x as a person wants to see it first: names, dtypes and shapes, never more than a screen."""
+    """A short description of x: names, dtypes and shapes, never more than a screen."""
     for depth in (6, 4, 3, 2, 1):
         lines = _lines(_parts(x, depth), 0, "")
         if len(lines) <= LINES:

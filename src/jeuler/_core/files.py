@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and nothing replaced but plain files."""
+"""Files are written whole or not at all, and only plain files are replaced."""
 
 from __future__ import annotations
 

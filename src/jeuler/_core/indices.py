@@ -1,4 +1,4 @@
-"""Indices of particles, fixed while tracing."""
+"""Indices of particles, constant while tracing."""
 
 from __future__ import annotations
 

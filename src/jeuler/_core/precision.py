@@ -1,4 +1,4 @@
-"""Running a part of the work in a precision of its own, whatever that of the program around it."""
+"""Running part of the work in a given precision, whatever the precision of the program around it."""
 
 from __future__ import annotations
 

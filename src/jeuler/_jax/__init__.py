@@ -1,3 +1,3 @@
-"""All that leans on JAX internals: the one package to reread when JAX moves."""
+"""Everything that depends on JAX internals: the one package to check when JAX changes."""
 
-"""All that leans on JAX internals: the one package to reread when JAX moves."""
+"""Everything that depends on JAX internals: the one package to check when JAX changes."""

@@ -1,4 +1,4 @@
-"""A jaxpr of one member of an ensemble, worked out for all members with the batch axis last.
+"""A jaxpr of one member of an ensemble, evaluated for all members with the batch axis last.
 
 Axes of a member keep their numbers if the batch axis is behind them. So most operations, elementwise ones and those
 along named axes, take their operands as they come; a few name shapes, which get one number more. Others have no such

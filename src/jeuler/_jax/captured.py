@@ -36,11 +36,11 @@ ARRAY = "array"
 
 
 class Opaque(Exception):
-    """Something that a function depends on cannot be compared with what it will be at another call."""
+    """A function depends on a value that cannot be compared between calls."""
 
 
 class Parts:
-    """One object: what names it among its kind, the objects within it, and how to make it again from such objects.
+    """An object taken apart: what identifies it among its type, the objects it holds, and how to rebuild it from such.
 
     Without ``make`` it is always the same object; arrays within it are compared by identity then.
     """
@@ -144,7 +144,7 @@ def _of_function(f: types.FunctionType) -> Parts:
 
 
 def _from_modules(values: Any, attributes: tuple[str, ...]) -> Any:
-    """What code finds in modules of the person's own; Opaque where a module gives other values each time."""
+    """What code finds in modules of the user's own; Opaque where a module gives other values each time."""
     found = []
     for module in values:
         if not isinstance(module, types.ModuleType):
@@ -222,7 +222,7 @@ def named_in(code: types.CodeType) -> _Names:
 
 
 def _of_class(kind: type) -> Parts:
-    """A class of the person's own: its functions may change, as in a notebook whose cell is run again."""
+    """A class of the user's own: its functions may change, as in a notebook whose cell is run again."""
     if any(not trusted(type(base).__module__) for base in kind.__mro__):
         raise Opaque(f"metaclass of {kind.__name__}")
     inner = [base for base in kind.__bases__ if base is not object]

@@ -1,4 +1,4 @@
-"""Primitives and jaxprs, as jax.extend.core has them: importing that module takes 30 ms, for Pallas comes with it."""
+"""Primitives and jaxprs, as jax.extend.core has them: importing that module takes 30 ms, as it imports Pallas."""
 
 from __future__ import annotations
 

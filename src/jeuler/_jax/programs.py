@@ -210,7 +210,7 @@ def _is_dynamic(leaf: Any) -> bool:
 
 
 def _stands_alone(classes: set[type], x: Any) -> bool:
-    """Whether a node of the inputs is compared as a whole; other classes of the person's own are noted."""
+    """Whether a node of the inputs is compared as a whole; other classes of the user's own are noted."""
     kind = type(x)
     if kind is Function or kind is Partitioned:
         return True

@@ -102,12 +102,8 @@ def work_precision(
     checks.untraced("work_precision", y0, args, t0, t1)
     f, args = arrays_only(f, args, is_parameter)
     t0, t1 = checks.interval(t0, t1)
-    if not isinstance(problem, str):
-        raise ValueError(f"problem must be a string, the name of the problem, got {checks.shown(problem)}")
-    repeats, points = checks.count("repeats", repeats, least=1), checks.count("points", points, least=1)
-    checks.positive("timeout", timeout, "s")
-    plans = make_plans(named(steps), dts, tolerances, t0, t1, points)
-    dtypes = checked_dtypes(dtypes, y0)
+    repeats, points = checked_counts(problem, repeats, points, timeout)
+    plans, dtypes = make_plans(named(steps), dts, tolerances, t0, t1, points), checked_dtypes(dtypes, y0)
     sweep = Sweep(f, t0, t1, points, repeats, timeout, gradient, adjoint)
     with double_precision():
         y64, args64 = cast(y0, np.float64), cast(args, np.float64)
@@ -119,16 +115,13 @@ def work_precision(
         with precision(dtype):
             counts[dtype] = [sweep.count(plan, cast(y0, dtype), cast(args, dtype)) for plan in plans]
     with double_precision():
-        looked_at = [t0, t1, *sweep.moments, *(t for plan in plans for run in plan.fixed for t in run.times)]
-        looked_at += [t for of in counts.values() for plan in of for count in plan for t in thinned(count, points)[0]]
+        states = [t for of in counts.values() for plan in of for count in plan for t in thinned(count, points)[0]]
+        looked_at = [t0, t1, *sweep.moments, *(t for plan in plans for run in plan.fixed for t in run.times), *states]
         truth = make_reference(reference, f, y64, args64, distinct(np.array(looked_at), t0, t1), size)
-        slope = None
-        if gradient is not None:
-            slope = make_reference_gradient(gradient, reference, f, y64, args64, t0, t1)
-
-    rows: list[dict[str, Any]] = []
+        slope = gradient and make_reference_gradient(gradient, reference, f, y64, args64, t0, t1)
     same = {"problem": problem, "t0": t0, "t1": t1, "reference_error": truth.error}
     total = len(dtypes) * sum(len(plan.runs) for plan in plans)
+    rows: list[dict[str, Any]] = []
     with tqdm(total=total, delay=2, disable=None if progress is None else not progress, unit="run") as bar:
         for dtype in dtypes:
             with precision(dtype):
@@ -156,6 +149,14 @@ def stability_limits(plans: list[Plan], f: VectorField, t0: float, y0: PyTree, a
             return math.nan
 
     return [limit(plan.method.step) for plan in plans]
+
+
+def checked_counts(problem: Any, repeats: Any, points: Any, timeout: Any) -> tuple[int, int]:
+    """How many measured runs and times there are, or one ValueError."""
+    if not isinstance(problem, str):
+        raise ValueError(f"problem must be a string, the name of the problem, got {checks.shown(problem)}")
+    checks.positive("timeout", timeout, "s")
+    return checks.count("repeats", repeats, least=1), checks.count("points", points, least=1)
 
 
 def checked_dtypes(dtypes: Any, y0: PyTree) -> list[np.dtype]:

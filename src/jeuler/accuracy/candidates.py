@@ -92,7 +92,7 @@ def default_candidates(f: VectorField, y0: PyTree, t0: float, args: PyTree) -> l
 
 
 def given_candidates(methods: Mapping[str, Any]) -> list[Candidate]:
-    """Methods of the person's own, a diffrax solver by its tolerance where it has an error estimate."""
+    """Methods of the user's own, a diffrax solver by its tolerance where it has an error estimate."""
 
     def adaptive(method: Any) -> bool:
         if not is_diffrax(method):
@@ -182,7 +182,7 @@ def _fixed(candidate: Candidate, problem: Problem) -> Any:
 def written_out(candidate: Candidate, problem: Problem, num_steps: int) -> Any:
     """``(y0, args, t0, t1) -> result`` by `solve` for one number of steps, with dt as a constant of the program.
 
-    So a person writes it; XLA may make a program of another speed of it.
+    As a user writes it: XLA may compile that to a program of another speed.
     """
 
     def run(y0, args, t0, t1):

@@ -19,7 +19,7 @@ TOLERANCES = 1e-11, 1e-13  # relative and, times the size of y0, absolute; the s
 
 
 class Norm:
-    """A norm of the person's own, of a state or a difference of states given as its numbers."""
+    """A norm of the user's own, of a state or a difference of states given as its numbers."""
 
     def __init__(self, norm: Callable[[PyTree], Any], y0: PyTree) -> None:
         self.norm, (vector, self.unflatten) = norm, trees.real_vector(y0)

@@ -75,7 +75,7 @@ class Trial:
         return self.compiled_for(program(self.candidate, self.problem))
 
     def as_written(self, setting: Any) -> Any:
-        """``() -> result``: the run as the person will make it, compiled for its number of steps."""
+        """``() -> result``: the run as the user will make it, compiled for its number of steps."""
         if self.candidate.adaptive or is_diffrax(self.candidate.step):
             with precision(self.dtype):
                 run = functools.partial(self.program, self.setting(setting))

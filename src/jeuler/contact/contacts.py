@@ -18,7 +18,7 @@ CANDIDATES = 2  # pairs followed in a step, for each particle and dimension, whe
 
 
 class Look(NamedTuple):
-    """What there is to know of each contact at one time of its own."""
+    """Gap, normal and relative motion of each contact, each at its own time."""
 
     gap: Array  # (contact,), distance between the surfaces, m
     slope: Array  # (contact,), d gap / ds, m a step
@@ -93,13 +93,13 @@ class Contacts:
         return jnp.concatenate([jnp.asarray(walls, bool), jnp.ones(len(self.i), bool)])
 
     def possible(self) -> Array:
-        """Which contacts there are: alive, and something of it can move."""
+        """Which contacts can occur: both partners are alive, and one of them can move."""
         wall = jnp.tile(self.alive & (self.inverse_mass > 0), len(self.colliders))
         moves = self.inverse_mass[self.i] + self.inverse_mass[self.j] > 0
         return jnp.concatenate([wall, self.listed & self.alive[self.i] & self.alive[self.j] & moves])
 
     def first(self, y: Array) -> Array:
-        """What the first partner of each contact has of y, (particle, ...)."""
+        """y of the first partner of each contact, y being (particle, ...)."""
         return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i]] if len(self.i) else [])])
 
     def second(self, y: Array) -> Array:
@@ -140,7 +140,7 @@ class Contacts:
         return total
 
     def look(self, path: Path, s: Array) -> Look:
-        """What there is to know of each contact where its partners are at its own s."""
+        """Gap, normal and relative motion of each contact, with its partners where they are at its own s."""
         parts = [self._look_at_collider(k, path, s) for k in range(len(self.colliders))]
         if len(self.i):
             parts.append(self._look_at_pairs(path, s[self.walls :]))
@@ -169,7 +169,7 @@ class Contacts:
         return Look(gap, along, normal, jnp.zeros_like(gap), speed - other)
 
     def roundoff(self, x: Array) -> Array:
-        """What a gap of zero may look like, (contact,), m."""
+        """How large a gap of zero may come out by roundoff, (contact,), m."""
         size = jnp.max(jnp.abs(x), axis=-1) + self.radius
         return jax.lax.stop_gradient(TOUCH * jnp.finfo(x.dtype).eps * self.both(jnp.maximum, size))
 

@@ -138,7 +138,7 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
 
 
 def choose(contacts: Contacts, found: Found) -> Events:
-    """Who meets what in this round: the impacts that come first among all those of their particles and neighbours."""
+    """The impacts of this round: those that come first among all those of their particles and neighbours."""
     n, numbers = contacts.particles, jnp.arange(contacts.count)
     i, j, pairs = contacts.i, contacts.j, slice(contacts.walls, None)
 
@@ -165,7 +165,7 @@ def choose(contacts: Contacts, found: Found) -> Events:
 
 
 def meet(contacts: Contacts, path: Path, events: Events) -> tuple[Array, Look]:
-    """The time of each contact's impact as a function of the paths, and what there is to know of it then.
+    """The time of each contact's impact as a function of the paths, and the contact's geometry then.
 
     gap(path, s) = 0,   in an overlap s is that of the later last impact of its partners
     """

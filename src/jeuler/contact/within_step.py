@@ -22,7 +22,7 @@ IMPACTS = "impacts"  # the name of what the search of a step has found
 
 
 def _kept(primitive: Any, *_: Any, name: str = "", label: str = "", **__: Any) -> bool:
-    """What reverse mode keeps of a step: what searches and solves have found; the rest it works out again."""
+    """What reverse mode keeps of a step: the results of searches and solves; it recomputes the rest."""
     return name in (IMPACTS, REST) or label == REST or primitive is found_p
 
 

@@ -1,7 +1,8 @@
-"""Effects: ``effect(t, dt, state, key) -> state`` at each step, in the order written. One file a family."""
+"""Effects: ``effect(t, dt, previous, state, key) -> state`` at each step, in the order written."""
 
 from jeuler.effects.appearance import OverLife, SpeedLimit
-from jeuler.effects.lifecycle import Death, DeathOnContact, DeathOutside, Emitter, Lifetime
+from jeuler.effects.births import Emitter
+from jeuler.effects.deaths import Death, DeathOnContact, DeathOutside, Lifetime
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
 
 __all__ = [

@@ -140,7 +140,7 @@ class Problem:
         weights: PyTree = None,
         stages: Iterable[PyTree] = (),
     ) -> Problem:
-        """From what a person passes, or one ValueError that says what is wrong with it."""
+        """From what the user passes, or one ValueError that says what is wrong with it."""
         layout = Layout.of(params)
         x = layout.vector(params)
         lower, upper = checked_bounds(layout, x, bounds, positive)

@@ -1,4 +1,4 @@
-"""From where a search ended to a `Fit`: its errors, and what is to be said about it."""
+"""The report of a search as a `Fit`: best parameters, standard errors and message."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def report(
     known: Known,
     starts: Any = None,
 ) -> Fit:
-    """What was found, with its errors and what is to be said about it; ``words`` say how the search ended."""
+    """The best parameters with their standard errors and a message; ``words`` say how the search ended."""
     layout, x = problem.layout, np.asarray(state.x)
     size = max(int(np.sum(np.asarray(problem.weights) > 0)), 1)
     total = float(state.total)

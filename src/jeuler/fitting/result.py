@@ -138,7 +138,7 @@ class Verdict:
     more: tuple[str, ...] = ()
 
     def message(self) -> str:
-        """One sentence: how it ended, and all that a person must know before they use it."""
+        """One sentence: how it ended, and what must be known before the fit is used."""
         parts = [self.ending]
         if self.nonfinite:
             parts.append(f"stepped back from {self.nonfinite} points that were not finite")

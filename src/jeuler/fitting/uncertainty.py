@@ -4,7 +4,7 @@ Residuals of real recordings are correlated in time, and independent noise is th
 e_k = 0.9 e_(k-1) + white, errors by the usual formula are 3 to 4 times too small. Here the noise is an autoregressive
 process whose order is chosen by an information criterion, and the covariance is that of least squares under such noise.
 Why this way: block bootstraps and the kernels of econometrics (Newey-West) cut the correlation off after some lags and
-cover too little when it is long; a generalised least squares fit would move the best point, and the person asked for
+cover too little when it is long; a generalised least squares fit would move the best point, and the user asked for
 least squares. Residuals are more alike white noise than the noise was, as the fit follows it; their autocovariances are
 corrected for that.
 """

@@ -138,7 +138,7 @@ def readable(path: tuple[Any, ...]) -> str:
 
 
 def _in_plain_containers(path: tuple[Any, ...]) -> bool:
-    """Whether a leaf is in dicts, lists and tuples, where a person put it, and not part of a class."""
+    """Whether a leaf is in dicts, lists and tuples, where the user put it, and not part of a class."""
     return all(isinstance(key, (jax.tree_util.DictKey, jax.tree_util.SequenceKey)) for key in path)
 
 

@@ -1,4 +1,4 @@
-"""Forces: ``force(t, position, velocity, mass) -> (particle, dim)`` in N. One file a family."""
+"""Forces: ``force(t, position, velocity, mass) -> (particle, dim)`` in N. A file for each kind."""
 
 from jeuler.forces.air import Gust, Turbulence, Vortex, Wind, turbulence
 from jeuler.forces.attraction import PointAttractor

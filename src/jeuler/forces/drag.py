@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -202,7 +203,7 @@ def _drag_at(w: Sequence[Array] | None, drags: Sequence[Flow]) -> Sequence[Any]:
     return [total(terms) for terms in zip(*(d.force(at) for d in there), strict=True)]
 
 
-class _Drag:
+class _Drag(abc.ABC):
     """What the drags share."""
 
     coefficient: Array
@@ -213,8 +214,9 @@ class _Drag:
         check_limits(self)
         object.__setattr__(self, "air", as_air(self.air))
 
+    @abc.abstractmethod
     def drag(self, t: Any, position: Array) -> Resistance:
-        raise NotImplementedError
+        """The drag at one time and place."""
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         return stack(self.drag(t, position).force(split(velocity)))

@@ -181,7 +181,7 @@ class Rows(Indexed):
         place = np.full(particles, empty)
         place[order] = np.arange(len(order))
 
-        # What each row owns.
+        # Own edges of each row.
         owner, other = place[owner], place[other]
         by = np.lexsort((other, owner))
         owner, other, numbers = owner[by], other[by], numbers[by]
@@ -193,7 +193,7 @@ class Rows(Indexed):
         edge[column, row] = numbers
         self.slot_edges: tuple[np.ndarray, ...] = (edge,)
 
-        # What each row meets.
+        # Edges that each row looks up.
         by = np.argsort(other, kind="stable")
         slot = (column * far.shape[1] + row)[by]
         row, column, meets_further = in_rows(other[by], empty + 1, LONGEST_ROW)
@@ -295,7 +295,7 @@ def in_rows(key: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.nd
 
 
 def columns_for(owned: np.ndarray) -> int:
-    """How many columns cost least, if each particle owns so many edges."""
+    """The number of columns that costs least, given how many edges each particle owns."""
     widths = np.arange(1, max(2, min(owned.max(), LONGEST_ROW) + 1))
     rows = np.array([np.maximum(-(-owned // width), 1).sum() for width in widths])
     return int(widths[np.argmin(widths * rows + FURTHER_COST * (rows - len(owned)))])

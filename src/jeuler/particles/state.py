@@ -35,7 +35,7 @@ class ParticleState:
     """What the particles of a system are at one time.
 
     Position, velocity and mass are always there. Every other field is None, and costs nothing, unless the scene or
-    the person uses it. `simulate` adds the fields that the effects of its scene write.
+    the user sets it. `simulate` adds the fields that the effects of its scene write.
 
     Args:
       position: (particle, dim), m.
@@ -226,7 +226,7 @@ def with_default_fields(
 ) -> ParticleState:
     """The state with default values in those of the named fields that it lacks; mass becomes one a particle.
 
-    ``shapes``: of one particle's value, for fields of the person's own that are not one number.
+    ``shapes``: of one particle's value, for fields of the user's own that are not one number.
     """
     particles, dtype = len(state.position), state.position.dtype
     values: dict[str, Array] = {}

@@ -21,7 +21,7 @@ PyTree = Any
 Run = Callable[[PyTree], PyTree]
 
 
-SMALLEST, RATIO, MOST = 1024, 2**0.5, 12  # of the windows that are chosen for the person
+SMALLEST, RATIO, MOST = 1024, 2**0.5, 12  # of the windows that are chosen for the user
 
 
 def ladder(capacity: int) -> tuple[int, ...]:

@@ -25,7 +25,7 @@ from jeuler._jax import random_rows
 class Sampler:
     """What the samplers share: ``at(u)``, a smooth function of uniform numbers u, (numbers, count), in [0, 1)."""
 
-    numbers: Any  # that a particle takes; None where a function of the person's own draws them from a key
+    numbers: Any  # that a particle takes; None where a function of the user's own draws them from a key
     at: Any
 
     def __call__(self, key: Array, count: int) -> Array:

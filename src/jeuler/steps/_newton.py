@@ -79,7 +79,7 @@ def _newton_class() -> Any:
     import optimistix
 
     class Newton(optimistix.Newton):
-        """Newton's method that is done when the correction is small.
+        """Newton's method that ends when the correction is small.
 
         optimistix asks that the residual be small too, which rounding forbids where dt |J| is large.
         """

@@ -47,7 +47,7 @@ def explicit(order: int) -> Callable[[Callable[..., PyTree]], Any]:
 def is_explicit_of_first_order(step: Any) -> bool:
     """Whether a step says of itself that it is explicit and of order 1: v + dt a(v), so that long ones overshoot.
 
-    A step of the person's own does so with the attributes ``step.explicit = True`` and ``step.order = 1``.
+    A step of the user's own does so with the attributes ``step.explicit = True`` and ``step.order = 1``.
     """
     return getattr(step, "explicit", False) is True and getattr(step, "order", None) == 1
 
