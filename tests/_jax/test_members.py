@@ -136,3 +136,18 @@ def test_operations_with_the_batch_axis_last_are_those_of_vmap(function, expecte
     theirs = jax.jit(jax.vmap(function, (0, 0, None)))
     for last, first in zip(ours(jnp.moveaxis(x, 0, -1), n, shared), theirs(x, n, shared), strict=True):
         np.testing.assert_allclose(jnp.moveaxis(last, -1, 0), first, rtol=1e-12)
+
+
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.rk4_step])
+@pytest.mark.parametrize("by_numbers", [True, False])
+def test_members_that_are_taken_apart_into_numbers_stay_as_vmap_has_them(step, by_numbers):
+    def field(t, y, p):
+        if not by_numbers:
+            return p * y * y - y
+        return jnp.stack([10 * (y[1] - y[0]), y[0] * (p - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2]])
+
+    def run(y):
+        return jeuler.solve(field, y, args=0.5, dt=0.1, num_steps=2, step=step).y
+
+    jaxpr = str(jax.make_jaxpr(jax.vmap(run))(jnp.ones((100, 3))))
+    assert ("size=100" in jaxpr) is not by_numbers

@@ -8,6 +8,7 @@ form here (`fits` says which): gathers, sorts, matrix products, loops.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -76,6 +77,28 @@ def _flow(jaxpr: Jaxpr, batched: tuple[bool, ...]) -> tuple[bool, tuple[bool, ..
             inner = _inner(eqn)
             all_fit &= fits(inner[0], of) if inner else _has_form(eqn, of)
     return all_fit, tuple(is_variable(v) and v in found for v in jaxpr.outvars)
+
+
+def mostly_numbers(jaxpr: Jaxpr, batched: Sequence[bool]) -> bool:
+    """Whether more of the arithmetic on these operands is of single numbers than of arrays."""
+    return _arithmetic(jaxpr, tuple(batched)) > 0
+
+
+@functools.lru_cache(maxsize=256)
+def _arithmetic(jaxpr: Jaxpr, batched: tuple[bool, ...]) -> int:
+    """How many more elementwise operations on these operands are of single numbers than of arrays."""
+    found = {v for v, b in zip(jaxpr.invars, batched, strict=True) if b}
+    more = 0
+    for eqn in jaxpr.eqns:
+        of = tuple(is_variable(v) and v in found for v in eqn.invars)
+        if any(of):
+            found.update(eqn.outvars)
+            inner = _inner(eqn)
+            if inner:
+                more += _arithmetic(inner[0], of)
+            elif eqn.primitive.name in ELEMENTWISE:
+                more += 1 if math.prod(eqn.outvars[0].aval.shape) == 1 else -1
+    return more
 
 
 def _has_form(eqn: Any, batched: Sequence[bool]) -> bool:
