@@ -24,6 +24,7 @@ def fit(
     positive: PyTree = False,
     sigma: PyTree = None,
     weights: PyTree = None,
+    priors: dict[str, Any] | None = None,
     loss: str = "linear",
     loss_scale: float | None = None,
     starts: Any = None,
@@ -56,6 +57,8 @@ def fit(
       sigma: the known error of each residual, a number or a tree broadcast to its structure; the covariance is then
         not scaled by the residual. inf leaves a residual out.
       weights: relative weights instead, such as 1 / variance; the covariance is scaled by the residual.
+      priors: ``{name: (mean, sigma)}``, what is known of parameters beforehand: each is one more row of the residual,
+        (parameter - mean) / sigma. They need ``sigma`` of the data, and are part of the covariance.
       loss: "linear" for squares, or "soft_l1" or "huber", which bend for outliers.
       loss_scale: the size of a residual, over sigma if that is given, at which they bend; None takes 1.345 times sigma,
         or else 1.345 times what the median of the residuals says of it.
@@ -93,6 +96,15 @@ def fit(
         progress=progress,
     )
     problem = Problem.of(
-        residual, params, data=data, bounds=bounds, positive=positive, sigma=sigma, weights=weights, stages=stages
+        residual,
+        params,
+        data=data,
+        bounds=bounds,
+        positive=positive,
+        sigma=sigma,
+        weights=weights,
+        stages=stages,
+        priors=priors,
+        loss=loss,
     )
     return run(problem, options, scale=scale).fit

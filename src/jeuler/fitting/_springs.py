@@ -109,6 +109,7 @@ def fit_springs(
     bounds: dict[str, Any] | None = None,
     sigma: Any = None,
     weights: Any = None,
+    priors: dict[str, Any] | None = None,
     loss: str = "linear",
     loss_scale: float | None = None,
     start: str = "data",
@@ -147,6 +148,7 @@ def fit_springs(
       sigma: the known error of the positions, m, broadcast to (time, particle, dim); errors are then not scaled by the
         residual.
       weights: relative weights instead, broadcast to (time, particle, dim).
+      priors: ``{name: (mean, sigma)}`` of parameters, known beforehand, as in `fit`; they need ``sigma``.
       loss, loss_scale: "linear", or "soft_l1" or "huber" for outliers, as in `fit`.
       start: "data" finds ks, kd and what else enters the forces linearly from the positions alone, by the weak form of
         the equation of motion, and starts there; "given" starts from the scene's values. Where the first does not lead
@@ -197,7 +199,7 @@ def fit_springs(
     task = Recorded.of(
         scene, state, times, positions, dt=dt, t0=t0, num_steps=num_steps, step=step, names=parameters, where=where
     )
-    found, begun = task.fit(options, bounds, sigma, weights, start, grow)
+    found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors)
     fields, bias, fitted_scene, fitted_state, predicted = task.completed(found, step_bias)
     complete = SpringFit(
         ks=values_of_springs(fitted_scene, "ks"),

@@ -18,6 +18,7 @@ from jeuler._core.partition import OfArrays, arrays_only
 from jeuler._jax.programs import is_transformed
 from jeuler.fitting.evaluate import Evaluate, evaluations
 from jeuler.fitting.least_squares import Task
+from jeuler.fitting.priors import Priors
 from jeuler.fitting.unknowns import Layout, checked_bounds
 
 PyTree = Any
@@ -32,11 +33,13 @@ class FlatResidual:
     residual: Callable[..., Any]
     layout: Layout
     with_data: bool
+    priors: Priors | None = None
 
     def __call__(self, x: Array, data: Any) -> Array:
         params = self.layout.params(x)
         out = self.residual(params, data) if self.with_data else self.residual(params)
         leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(out)]
+        leaves += [] if self.priors is None else [self.priors.rows(x)]
         return jnp.concatenate(leaves).astype(self.layout.dtype) if leaves else jnp.zeros(0, self.layout.dtype)
 
 
@@ -59,12 +62,15 @@ def programs(residual: FlatResidual, data: Any) -> Evaluate:
     if not hasattr(function, "forward"):
         return evaluate
     forward = function.forward(residual.layout, data if whole is None else whole(data))
-    return dataclasses.replace(
-        evaluate, at=lambda x, data: forward.residual_at(x, data if whole is None else whole(data))
-    )
+
+    def at(x: np.ndarray, data: Any) -> Any:
+        found = forward.residual_at(x, data if whole is None else whole(data))
+        return found if residual.priors is None else residual.priors.after(found, x)
+
+    return dataclasses.replace(evaluate, at=at)
 
 
-def residual_layout(residual: Callable[..., Any], params: PyTree, data: Any, with_data: bool) -> tuple[Layout, bool]:
+def residual_form(residual: Callable[..., Any], params: PyTree, data: Any, with_data: bool) -> tuple[Any, bool]:
     """The form of what the residual returns, and whether it closes over something traced; or one ValueError."""
     checks.function(
         "residual",
@@ -74,7 +80,7 @@ def residual_layout(residual: Callable[..., Any], params: PyTree, data: Any, wit
     )
     layout = Layout.of(params)
     if hasattr(residual, "form") and not is_transformed():  # it says so itself, and nothing is traced
-        return Layout.of(residual.form(data)), False
+        return residual.form(data), False
     flat = jax.ShapeDtypeStruct((layout.size,), layout.dtype)
     if with_data:
         program, form = jax.make_jaxpr(lambda x, data: residual(layout.params(x), data), return_shape=True)(flat, data)
@@ -84,7 +90,7 @@ def residual_layout(residual: Callable[..., Any], params: PyTree, data: Any, wit
     for leaf in leaves:
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise ValueError(f"residual must return real floating arrays, got {leaf.dtype}; convert what it returns")
-    return Layout.of(form), any(map(checks.is_traced, program.consts))
+    return form, any(map(checks.is_traced, program.consts))
 
 
 def series_of(layout: Layout) -> tuple[tuple[int, int], ...]:
@@ -139,6 +145,8 @@ class Problem:
         sigma: PyTree = None,
         weights: PyTree = None,
         stages: Iterable[PyTree] = (),
+        priors: Any = None,
+        loss: str = "linear",
     ) -> Problem:
         """From what the user passes, or one ValueError that says what is wrong with it."""
         layout = Layout.of(params)
@@ -149,19 +157,30 @@ class Problem:
             residual, data = arrays_only(residual, data)
         if not layout.size:
             raise ValueError(f"params must hold at least one floating number, got {checks.shown(params)}")
-        form, closes_over_traced = residual_layout(residual, params, data, with_data)
+        shape, closes_over_traced = residual_form(residual, params, data, with_data)
+        form = Layout.of(shape)
         if not form.size or not layout.size:
             raise ValueError(
                 f"residual and params must not be empty, got {form.size} residuals and {layout.size} parameters"
             )
         weight = residual_weights(form, sigma, weights)
         masks = tuple(_stage(form, stage, weight) for stage in stages)
-        flat = FlatResidual(residual, layout, with_data)
+        known = Priors.of(layout, priors, sigma, loss)
+        flat = FlatResidual(residual, layout, with_data, known)
+        if known is not None:
+            form = Layout.of({"data": shape, "priors": jax.ShapeDtypeStruct((1, len(known.places)), layout.dtype)})
+            weight, *rest = (_joined(values, 1 / np.asarray(known.sigmas)) for values in (weight, *masks))
+            masks = tuple(rest)
         return cls(flat, form, data, x, lower, upper, weight, sigma is not None, masks, closes_over_traced)
 
     @property
     def layout(self) -> Layout:
         return self.residual.layout
+
+    def of_data(self, residual: Any) -> PyTree:
+        """A residual vector in the structure that the residual function returns, without the rows of priors."""
+        parts = self.form.params(residual)
+        return parts if self.residual.priors is None else parts["data"]
 
     @property
     def traced(self) -> bool:
@@ -191,6 +210,10 @@ class Problem:
             own = [np.asarray(a, float) for a in (self.weights, self.weights, self.lower, self.upper)]
             rest = [np.asarray(a, float) for a in (1.0, tolerance, self.precision, 0.0)]
         return Task(self.data, *own, *rest)
+
+
+def _joined(a: Any, b: Any) -> Any:
+    return (jnp if checks.is_traced(a) else np).concatenate([a, b])
 
 
 def _stage(form: Layout, stage: PyTree, weight: Any) -> Any:

@@ -116,7 +116,16 @@ class Recorded:
         parts = (self.scene, self.state, self.targets, self.start)
         return any(map(checks.is_traced, jax.tree.leaves(parts)))
 
-    def problem(self, start: dict[str, Any], bounds: Any, sigma: Any, weights: Any, stages: Any) -> Problem:
+    def problem(
+        self,
+        start: dict[str, Any],
+        bounds: Any,
+        sigma: Any,
+        weights: Any,
+        stages: Any,
+        priors: Any = None,
+        loss: str = "linear",
+    ) -> Problem:
         """The least-squares problem from this start."""
         data = self.data
         columns = np.asarray(self.prediction.columns, int)
@@ -150,14 +159,16 @@ class Recorded:
             sigma=sigma,
             weights=weights,
             stages=stages,
+            priors=priors,
+            loss=loss,
         )
 
     def fit(
-        self, options: Options, bounds: Any, sigma: Any, weights: Any, start: str, grow: bool
+        self, options: Options, bounds: Any, sigma: Any, weights: Any, start: str, grow: bool, priors: Any = None
     ) -> tuple[Outcome, str]:
         """Search from the data and, where that is not good, from the scene's values; the better, and its start."""
         stages = self._stages() if grow else ()
-        given = self.problem(self.start, bounds, sigma, weights, stages)
+        given = self.problem(self.start, bounds, sigma, weights, stages, priors, options.loss)
         if self.traced:
             return run(given, options), "given"
         known, scale = self._known(given), self._scale()
@@ -198,7 +209,7 @@ class Recorded:
     def _known(self, problem: Problem) -> Known:
         """Variance and noise of the data, weighted as the residuals are."""
         flat = self.targets.reshape(len(self.times), -1)[:, np.asarray(self.prediction.columns, int)]
-        weight = np.asarray(problem.weights, float).reshape(flat.shape)
+        weight = np.asarray(problem.weights, float)[: flat.size].reshape(flat.shape)
         return Known(variance_of(flat, weight), noise_of(self.times, flat, weight))
 
     def _scale(self) -> dict[str, Any]:

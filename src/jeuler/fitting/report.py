@@ -83,7 +83,7 @@ def report(
         undetermined=errors.undetermined,
         nonfinite=int(state.nonfinite),
         stderr_white=errors.white,
-        residual=problem.form.params(np.asarray(state.residual)),
+        residual=problem.of_data(np.asarray(state.residual)),
         blind=errors.blind,
         at_bound=tuple(np.asarray(layout.names())[held]),
         starts=starts,
@@ -150,4 +150,7 @@ def errors_of(problem: Problem, state: State, spread: Any, loss: str) -> Uncerta
     influence = state.residual * slope**2
     counted = problem.weights > 0
     absolute = problem.absolute and loss == "linear"
-    return uncertainty(jacobian, influence, curvature, counted, series_of(problem.form), problem.precision, absolute)
+    series, fixed = series_of(problem.form), 0
+    if problem.residual.priors is not None:  # the last rows
+        series, fixed = series[:-1], len(problem.residual.priors.places)
+    return uncertainty(jacobian, influence, curvature, counted, series, problem.precision, absolute, fixed)

@@ -36,10 +36,12 @@ def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[st
     if not np.isfinite(half).all():
         return None, [f"at dt = {task.dt / 2:g} the run is not finite, so the bias of the step is not known"]
     with np.errstate(all="ignore"):
-        weights = np.where(whole != 0, state.residual / whole, 0)
+        weights = np.where(whole != 0, state.residual[: len(whole)] / whole, 0)
     order = getattr(task.prediction.step, "order", 1)
     jump = 2**order / (2**order - 1)
-    shift = _shift(state, (half - whole) * jump * weights)
+    change = np.zeros(len(state.residual))  # that of the rows of priors is 0
+    change[: len(whole)] = (half - whole) * jump * weights
+    shift = _shift(state, change)
     error = np.asarray(layout.vector(found.stderr), float)
     share = np.where(np.isfinite(error) & (error > 0), np.abs(shift) / np.where(error > 0, error, 1), 0)
     bias = layout.params(shift)

@@ -61,7 +61,7 @@ def run_traced(problem: Problem, options: Options) -> Fit:
         undetermined=(),
         nonfinite=state.nonfinite,
         stderr_white=layout.params(white),
-        residual=problem.form.params(weighted),
+        residual=problem.of_data(weighted),
         noise_ratio=jnp.sqrt(jnp.sum(weighted**2) / size) if problem.absolute else None,
         autocorrelation=found.autocorrelation,
     )

@@ -83,7 +83,14 @@ def directions(jacobian: Any, precision: float) -> Directions:
 
 
 def uncertainty(
-    jacobian: Any, residual: Any, curvature: Any, counted: Any, series: Series, precision: float, absolute: bool
+    jacobian: Any,
+    residual: Any,
+    curvature: Any,
+    counted: Any,
+    series: Series,
+    precision: float,
+    absolute: bool,
+    fixed: int = 0,
 ) -> Uncertainty:
     """Covariance of the parameters, for noise that is correlated along each series and for noise that is not.
 
@@ -97,6 +104,7 @@ def uncertainty(
       series: the parts of the residual vector, each (time, channel).
       precision: unit roundoff of the residual's arithmetic.
       absolute: True where the weights are 1 / sigma and sigma is to be believed.
+      fixed: how many rows at the end are of variance 1 and independent of all others, as those of priors are.
     Source: G. A. F. Seber, C. J. Wild, Nonlinear Regression, 1989, ch. 6; K. J. Worsley et al., A general statistical
       analysis for fMRI data, NeuroImage 15, 2002, app. A.3 (the correction of the autocovariances).
     """
@@ -109,7 +117,8 @@ def uncertainty(
     basis = d.left if xp is np and d.seen.all() else xp.where(d.seen, d.left, 0)
     shape = _inverse(basis.T @ _times(curvature, basis, xp), d.seen, xp)  # (Q^T diag(curvature) Q)^-1
     lags = _lags(series, n, m)
-    gamma = autocovariances(residual, counted, basis, series, lags, xp)
+    some = slice(0, m - fixed)
+    gamma = autocovariances(residual[some], counted[some], basis[some], series, lags, xp)
     enough = freedom > 0
     variance = xp.sum(residual**2) / xp.where(enough, freedom, 1)
     size = 1.0 if absolute else variance
@@ -118,10 +127,13 @@ def uncertainty(
     if xp is np and noise.order == 0:
         return _result(white, white, gamma, enough, d, n, absolute, variance, xp)
     unit = 1 / xp.where(gamma[0] > 0, gamma[0], 1) if absolute else 1.0
-    meat = unit * _through(basis, noise, series, xp)
+    meat = unit * _through(basis[some], noise, series, xp) + basis[m - fixed :].T @ basis[m - fixed :]
     correlated = half @ shape @ meat @ shape @ half.T
     influence = None if basis.size > LARGE else basis @ (half @ shape).T
-    wider = _student(_sensitivity(influence, n, noise, series, xp), noise, xp.sum(counted), xp)
+    known = 0.0 if influence is None else gamma[0] * xp.sum(influence[m - fixed :] ** 2, axis=0)
+    influence = None if influence is None else influence[some]
+    by_phi, share = _sensitivity(influence, known, n, noise, series, xp)
+    wider = _student(by_phi, share, noise, xp.sum(counted), xp)
     correlated = correlated * wider[:, None] * wider[None, :]
     use = xp.all(xp.isfinite(correlated)) & enough & (noise.order > 0)
     correlated = xp.where(use, correlated, white)
@@ -284,26 +296,28 @@ def _through(basis: Any, noise: Noise, series: Series, xp: Any) -> Any:
     return total
 
 
-def _sensitivity(influence: Any, n: int, noise: Noise, series: Series, xp: Any) -> Any:
-    """d log variance / d phi of each parameter, (n, lags), from what each residual adds to it, (m, n)."""
+def _sensitivity(influence: Any, known: Any, n: int, noise: Noise, series: Series, xp: Any) -> Any:
+    """d log variance / d phi of each parameter, (n, lags), from what each residual adds to it, (m, n);
+    and the share of it that is of the noise and not of priors, (n,)."""
     if influence is None:
-        return xp.zeros((n, len(noise.coefficients)))
-    variance, slope = 0.0, 0.0
+        return xp.zeros((n, len(noise.coefficients))), xp.ones(n)
+    variance, slope = known, 0.0
     for g in _parts(influence, series):
         share, by_phi = noise.spectrum(_length(len(g)), xp)
         power = sum(xp.abs(xp.fft.rfft(g[:, c], n=_length(len(g)), axis=0)) ** 2 for c in range(g.shape[1]))
         variance = variance + share @ power
         slope = slope + power.T @ (share[:, None] * by_phi)
-    return slope / xp.where(variance > 0, variance, 1)[:, None]
+    variance = xp.where(variance > 0, variance, 1)
+    return slope / variance[:, None], 1 - known / variance
 
 
-def _student(sensitivity: Any, noise: Noise, count: Any, xp: Any) -> Any:
+def _student(sensitivity: Any, share: Any, noise: Noise, count: Any, xp: Any) -> Any:
     """How much wider an error must be for its 95 % to be 1.96 of it, as the noise itself is only estimated.
 
     The logarithm of a variance has the variance 2 / (degrees of freedom); Student's quantile by Cornish and Fisher.
     """
     spread = xp.einsum("ik,kl,il->i", sensitivity, noise.spread, sensitivity) / xp.maximum(count, 1)
-    freedom = xp.clip(2 / (spread + 2 / xp.maximum(count, 1)), 3.0, 1e9)
+    freedom = xp.clip(2 / (spread + 2 * share**2 / xp.maximum(count, 1) + 1e-30), 3.0, 1e9)
     z = 1.959964
     t = z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)
     return t / z
