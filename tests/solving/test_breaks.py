@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from advice_problems import GRAVITY, HEIGHT, STIFFNESS, on_the_floor
 
 import jeuler
 
@@ -46,6 +47,27 @@ def test_a_square_wave_drives_an_oscillator(rtol):
     error, other = (np.hypot(y[0][-1] - x, y[1][-1] - v) / np.hypot(x, v) for y in (run.y, theirs))
     assert error < 100 * rtol
     assert error < max(10 * other, rtol)
+
+
+def test_a_ball_bounces_on_a_penalty_floor():
+    """Against the exact motion, free falls and half swings; and against Tsit5 of diffrax at the same tolerances."""
+    contact = jeuler.PenaltyContact(jeuler.Plane([0.0, 0.0], [0.0, 1.0]), ks=STIFFNESS)
+    scene = jeuler.Scene((jeuler.Gravity([0.0, -GRAVITY]), contact))
+    state = jeuler.ParticleState(jnp.array([[0.0, HEIGHT]]), jnp.zeros((1, 2)), mass=1.0)
+    (y0, args), t1 = scene.as_equation(state), 3.0
+    ours = jax.jit(lambda rtol: jeuler.solve_adaptive(
+        scene.vector_field, y0, t1=t1, args=args, rtol=rtol, atol=1e-3 * rtol
+    ).y)  # fmt: skip
+    theirs = jax.jit(lambda rtol: diffrax.diffeqsolve(
+        diffrax.ODETerm(scene.vector_field), diffrax.Tsit5(), 0.0, t1, None, y0, args,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol), max_steps=100_000,
+    ).ys)  # fmt: skip
+    exact = on_the_floor(t1)
+    for rtol in (1e-4, 1e-6, 1e-8):
+        ends = (np.array([y[0][-1, 0, 1], y[1][-1, 0, 1]]) for y in (ours(rtol), theirs(rtol)))
+        error, other = (np.linalg.norm(end - exact) / np.linalg.norm(exact) for end in ends)
+        assert error <= 100 * rtol
+        assert error <= max(10 * other, rtol)
 
 
 @pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.heun_step, jeuler.rk4_step, jeuler.implicit_euler_step])

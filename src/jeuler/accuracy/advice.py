@@ -270,7 +270,8 @@ class _Words:
         if growth < UNSTABLE or not self.near_instability(num_steps):
             one_fewer = search.error_after(num_steps - 1, final)
             if num_steps <= FEW and one_fewer > AIM:
-                return f"{smaller}, but with one step fewer it is {one_fewer:.2g} times the target"
+                aimed = "" if one_fewer > 1 else f" ({AIM:g} is aimed at)"
+                return f"{smaller}, but with one step fewer it is {one_fewer:.2g} times the target{aimed}"
             return f"{smaller}; no larger dt that was run meets the target with runs beside it within a factor 3"
         how = f"stability, not accuracy, sets dt: {smaller}"
         if is_explicit(self.search.step) and (steps := search.implicit_steps(final, num_steps // 2)):
