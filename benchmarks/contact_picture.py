@@ -73,7 +73,7 @@ def main():
                 axes[row, column].plot(along, found[row], "-" if name == "RK4" else "--", lw=1.3, label=name)
         axes[1, column].set_xlabel(label)
     axes[0, 0].set(ylabel="way along the floor in 0.8 s, m")
-    axes[0, 0].set(title="Thrown along the floor at 0.7 m/s, over start height")
+    axes[0, 0].set(title="Thrown along at 0.7 m/s, over start height")
     axes[0, 1].set(title="Thrown from 0.6 m, over start speed")
     axes[1, 0].set(ylabel="its derivative, m/m (left), s (right)")
     axes[0, 0].legend(frameon=False)
