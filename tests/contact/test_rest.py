@@ -17,12 +17,32 @@ def run(contact, position, velocity, *, dt, num_steps, forces=(GRAVITY,), effect
     return jeuler.simulate(jeuler.Scene(forces, (*effects, contact)), state, dt=dt, num_steps=num_steps, **how)
 
 
-def test_three_stacked_balls_stay_where_they_are():
-    stack = Collisions((FLOOR,), pairs=[(0, 1), (1, 2)], radius=0.1)
-    position = np.array([[0.0, 0.1], [0.0, 0.3], [0.0, 0.5]])
-    end = run(stack, position, 0 * position, dt=1 / 60, num_steps=2000, save_every=100)
-    np.testing.assert_allclose(end.y.position, np.broadcast_to(position, end.y.position.shape), atol=1e-6)
+def test_three_and_ten_stacked_balls_stay_where_they_are():
+    """33 s."""
+    three, ten = np.arange(3), np.arange(3, 13)
+    position = np.concatenate([np.stack([k + 0 * n, 0.1 + 0.2 * (n - n[0])], 1) for k, n in enumerate((three, ten))])
+    pairs = [(k, k + 1) for k in range(12) if k != 2]
+    stacks = Collisions((FLOOR,), pairs=pairs, radius=0.1)
+    end = run(stacks, position, 0 * position, dt=1 / 60, num_steps=2000, save_every=100)
+    np.testing.assert_allclose(end.y.position, np.broadcast_to(position, end.y.position.shape), atol=1e-9)
     assert int(end.unresolved_contacts) == 0
+
+
+def test_heap_that_falls_together_does_not_explode():
+    """More contacts than degrees of freedom, and more impacts in a step than are followed: they are counted."""
+    n = 24
+    position = np.array([[0.11 + 0.25 * i + 0.01 * (j % 2), 0.11 + 0.21 * j] for i in range(4) for j in range(6)])
+    box = (FLOOR, Plane([0.0, 0.0], [1.0, 0.0]), Plane([1.0, 0.0], [-1.0, 0.0]))
+    pairs = np.stack(np.triu_indices(n, 1), 1)
+    heap = Collisions(box, pairs=pairs, radius=0.1, restitution=0.3, friction=0.3, max_bounces=4)
+    end = run(heap, position, 0 * position, dt=0.01, num_steps=100, save_every=10, step=jeuler.symplectic_euler_step)
+    x, v = end.y.position, end.y.velocity
+    energy = 9.8 * jnp.sum(x[..., 1], axis=1) + jnp.sum(v**2, axis=(1, 2)) / 2
+    assert jnp.all(jnp.diff(energy) <= 1e-2 * energy[0])
+    gap = jnp.linalg.norm(x[:, pairs[:, 0]] - x[:, pairs[:, 1]], axis=-1) - 0.2
+    assert jnp.min(gap) > -2e-3
+    assert jnp.all((x[..., 1] > 0.098) & (x[..., 0] > 0.098) & (x[..., 0] < 0.902))
+    assert int(end.unresolved_contacts) > 0
 
 
 def test_overlapping_balls_part_and_do_not_fly_off():
@@ -108,6 +128,14 @@ def test_prescribed_paddle_is_not_pushed(mass):
     how = {"forces": (), "effects": (paddle,), "mass": jnp.array([mass, 1.0])}
     end = run(ball, [[0.0], [0.5]], np.zeros((2, 1)), dt=0.013, num_steps=150, **how).y
     np.testing.assert_allclose(end.velocity[-1, :, 0], [0.3, 0.6], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("far", "counted"), [(100.0, 0), (1e6, 3)])
+def test_contacts_far_from_the_origin_in_float32_are_counted(far, counted):
+    position = jnp.array([[far, 0.1]], jnp.float32)
+    end = run(Collisions((FLOOR,), radius=0.1), position, 0 * position, dt=jnp.float32(0.01), num_steps=3)
+    assert end.y.position.dtype == jnp.float32
+    assert int(end.unresolved_contacts) == counted
 
 
 def test_surface_that_is_nan_is_announced():

@@ -13,7 +13,7 @@ it is iterated with Nesterov's acceleration and restarts (H. Mazhar et al., ACM 
 do so on the friction cone), r the inverse of each contact's response, split among the contacts of a ball (R. Tonge et
 al., ACM Transactions on Graphics 31, 2012). The unknowns are changes of velocity w, m/s: what each impulse does to the
 relative velocity of its partners if it is alone. Displacements that leave no overlap are a linear system for one more
-unknown of each contact. One step of Newton's method on all these equations ends it; derivatives are those of the
+unknown of each contact. Where the unknowns are few, one step of Newton's method ends it; derivatives are those of the
 implicit function theorem on the active set.
 """
 
@@ -56,11 +56,8 @@ class Problem(NamedTuple):
     velocity: Array  # (contact, dim), relative, at the end of the step without contact, m/s
     gap: Array  # (contact,), at the end of the step without contact, over dt, m/s
     theta: Array  # (particle, 1), share of a kick that moves the particle in this step
-    active: Array  # (contact,)
-
-    def along(self, y: Array) -> Array:
-        """The normal component of the relative y, (contact,), of y (particle, dim)."""
-        return jnp.sum(self.contacts.relative(y) * self.normal, axis=-1)
+    active: Array  # (contact,), who touches
+    clear: Array  # (contact,), gap at the start, over dt, m/s: what does not touch is not to be pushed into either
 
     def push(self, w: Array) -> Array:
         """The normal component of w, (contact,), m/s."""
@@ -75,22 +72,41 @@ class Problem(NamedTuple):
         held = size < most  # strictly: friction 0 holds nothing
         return push * self.normal + jnp.where(held, y_t, y_t * (most / jnp.where(held | (size == 0), 1, size)))
 
-    def improve(self, w: Array, kick: Array, rate: Array) -> Array:
-        """The projection of which the impulses w, which give the kick, are a fixed point."""
-        return self.project(w - rate[:, None] * (self.velocity + self.contacts.relative(kick)))
+    def close(self) -> Array:
+        """Who touches, or may be pushed into, (contact,)."""
+        reach = 0.1 * self.contacts.both(jnp.add, self.contacts.radius)
+        return self.active | (self.contacts.possible() & (self.contacts.dt * self.clear < reach))
 
-    def gap_after(self, kick: Array) -> Array:
-        return self.gap + self.along(self.theta * kick)
+    def at_end(self, w: Array, q: Array) -> tuple[Array, Array, Array]:
+        """The relative velocity with the impulses w, (contact, dim), the gap over dt without q, and with it."""
+        both = self.contacts.move(jnp.concatenate([w, q[:, None] * self.normal], axis=1))
+        kick, shift = jnp.split(both, 2, axis=1)
+        kick, moved, shift = jnp.split(
+            self.contacts.relative(jnp.concatenate([kick, self.theta * kick, shift], axis=1)), 3, axis=1
+        )
+        gap = jnp.where(self.active, self.gap + self.push(moved), self.clear)
+        return self.velocity + kick, gap, gap + self.push(shift)
 
-    def shift(self, q: Array) -> Array:
-        return self.contacts.move(q[:, None] * self.normal)
+    def improve(self, u: Array, rate: Array, small: Array) -> Array:
+        """The projection of which the answer is a fixed point. u holds w, and in its last column q.
 
-    def residual(self, u: Array, rate: Array, on: Array) -> Array:
-        """What is to be 0: u holds the w of each contact, and its displacement q over dt."""
+        Overlaps are closed, down to ``small``. What presses is drawn together too, each by no more than its own gap, so
+        that gaps that cannot all be 0 at once leave it where it is.
+        """
         w, q = u[:, :-1], u[:, -1]
-        kick = self.contacts.move(w)
-        closed = jnp.where(on, self.gap_after(kick) + self.along(self.shift(q)), q)
-        return jnp.concatenate([w - self.improve(w, kick, rate), closed[:, None]], axis=1)
+        velocity, gap, left = self.at_end(w, q)
+        pressed = self.push(w) > 0
+        lowest = jnp.where(pressed, -jnp.maximum(gap, 0), 0)
+        q = jnp.where(self.close(), jnp.maximum(q - rate * (left + jnp.where(pressed, 0, small)), lowest), 0)
+        w = self.project(w - rate[:, None] * velocity)
+        return jnp.concatenate([w, q[:, None]], axis=1)
+
+    def residual(self, u: Array, rate: Array, on: Array, overlap: Array) -> Array:
+        """What is 0 at the answer where the gaps ``on`` are closed, down to an overlap; it has derivatives."""
+        w, q = u[:, :-1], u[:, -1]
+        velocity, _, left = self.at_end(w, q)
+        unmoved = w - self.project(w - rate[:, None] * velocity)
+        return jnp.concatenate([unmoved, jnp.where(on, left + overlap, q)[:, None]], axis=1)
 
 
 def at_rest(problem: Problem, small: Array) -> Rest:
@@ -98,28 +114,39 @@ def at_rest(problem: Problem, small: Array) -> Rest:
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
-    def acting(w, change):  # one of push and parts is 0, or a rounding; or several contacts could hold it
-        parts = problem.push(problem.velocity + change)
+    def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
         weak = 1e-4 * jnp.max(length(problem.velocity), initial=0)
-        return lax.stop_gradient(active & (problem.push(w) > parts + weak))
-
-    def overlaps(kick):
-        return lax.stop_gradient(active & (problem.gap_after(kick) < -small))
+        return lax.stop_gradient(active & (problem.push(w) > problem.push(velocity) + weak))
 
     if len(contacts.colliders) == 1 and not len(contacts.i):  # each particle for itself: exact at once
         w = problem.project(-problem.velocity)
-        on, unresolved = acting(w, w) | overlaps(w), jnp.int32(0)
-        u = jnp.concatenate([w, jnp.where(on, -problem.gap_after(w), 0)[:, None]], axis=1)
+        gap = problem.gap + problem.push(problem.theta * w)
+        on = pressed(w, problem.velocity + w) | lax.stop_gradient(active & (gap < -small))
+        u = jnp.concatenate([w, jnp.where(on, -gap, 0)[:, None]], axis=1)
+        unresolved = jnp.int32(0)
     else:
-        rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, active))
-        w, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate, small), REST)
+        rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, problem.close()))
+        start, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate, small), REST)
         unresolved = jnp.sum(active & (error > _tolerated(problem) + small)).astype(jnp.int32)
-        kick = contacts.move(w)
-        on = acting(w, contacts.relative(kick)) | overlaps(kick)
-        u = _solve(lambda u: problem.residual(u, rate, on), jnp.pad(w, ((0, 0), (0, 1))), anywhere(active))
-    kick, q = contacts.move(u[:, :-1]), u[:, -1]
-    gap = problem.gap_after(kick) + problem.along(problem.shift(q))
-    return Rest(kick, contacts.dt * problem.shift(q), on, jnp.where(on, contacts.dt * gap, 0), unresolved)
+        w, q = start[:, :-1], start[:, -1]
+        velocity, gap, _ = problem.at_end(w, q)
+        presses = pressed(w, velocity)
+        on = lax.stop_gradient(presses | ((q > 0) & ((gap < -small) | ~active)))
+        overlap = jnp.where(presses, 0, small)
+        u = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
+    w, q = u[:, :-1], u[:, -1]
+    _, _, left = problem.at_end(w, q)
+    shift = contacts.move(q[:, None] * problem.normal)
+    left = jnp.where(active, contacts.dt * left, 0)
+    return Rest(contacts.move(w), contacts.dt * shift, on, left, unresolved)
+
+
+def together(problem: Problem, small: Array) -> tuple[Array, Array]:
+    """The kick, m/s, and the shift, m, of the contacts that are active, (particle, dim), without derivative."""
+    contacts = problem.contacts
+    rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, problem.close()))
+    u, _ = _iterate(problem, rate, small / contacts.dt)
+    return contacts.move(u[:, :-1]), contacts.dt * contacts.move(u[:, -1:] * problem.normal)
 
 
 def _number_of_contacts(contacts: Contacts, active: Array) -> Array:
@@ -140,40 +167,48 @@ def _tolerated(problem: Problem) -> Array:
 
 
 def _iterate(problem: Problem, rate: Array, small: Array) -> tuple[Array, Array]:
-    """The fixed point by accelerated iterations, and what is left of each contact's velocity; ``small`` is none."""
+    """The fixed point (contact, dim + 1) by accelerated iterations, and how far each contact, m/s, is from it."""
     velocity = problem.velocity
     enough = jnp.maximum(1e-9, 30 * jnp.finfo(velocity.dtype).eps) * jnp.max(length(velocity), initial=0)
     enough = enough + 0.01 * jnp.min(small, initial=jnp.inf)
 
     def one(state):
-        w, ahead, weight, _, k = state
-        new = problem.improve(ahead, problem.contacts.move(ahead), rate)
-        restart = jnp.sum((ahead - new) * (new - w)) > 0
+        u, ahead, weight, _, k = state
+        new = problem.improve(ahead, rate, small)
+        restart = jnp.sum((ahead - new) * (new - u)) > 0
         weight = jnp.where(restart, 1.0, weight).astype(velocity.dtype)
         next_weight = (1 + jnp.sqrt(1 + 4 * weight**2)) / 2
         error = length(new - ahead) / rate
-        ahead = new + jnp.where(restart, 0, (weight - 1) / next_weight) * (new - w)
+        ahead = new + jnp.where(restart, 0, (weight - 1) / next_weight) * (new - u)
         return new, ahead, next_weight, error, k + 1
 
     def go_on(state):
         *_, error, k = state
         return (jnp.max(error, initial=0) > enough) & (k < ITERATIONS)
 
-    zero = jnp.zeros_like(velocity)
+    zero = jnp.pad(jnp.zeros_like(velocity), ((0, 0), (0, 1)))
     error = jnp.where(problem.active, jnp.inf, jnp.zeros_like(rate))
-    w, _, _, error, _ = lax.while_loop(go_on, one, (zero, zero, jnp.ones((), velocity.dtype), error, 0))
-    return w, error
+    u, _, _, error, _ = lax.while_loop(go_on, one, (zero, zero, jnp.ones((), velocity.dtype), error, 0))
+    return u, error
 
 
 def _solve(residual: Callable[[Array], Array], guess: Array, needed: Array) -> Array:
-    """The root of the residual, one step of Newton's method away from the guess; the guess where none is needed."""
+    """The root of the residual near the guess, and no worse than it; the guess where none is needed.
+
+    With few unknowns by one step of Newton's method, exact if the equations are the right ones and do not contradict
+    each other.
+    """
 
     def newton(residual, guess):
+        if guess.size > DENSE_UP_TO:
+            return guess, ()
+
         def step(_):
             value, slope = jax.linearize(residual, guess)
-            if guess.size > DENSE_UP_TO:  # w is right to the tolerance of the iteration: only the gaps are closed
-                value = value.at[:, :-1].set(0)
-            return guess - _solve_linear(slope, value)
+            new = guess - _solve_linear(slope, value)
+            rounding = 1e3 * jnp.finfo(guess.dtype).eps * jnp.max(jnp.abs(guess))
+            better = jnp.max(jnp.abs(residual(new))) <= 1e-3 * jnp.max(jnp.abs(value)) + rounding
+            return jnp.where(better, new, guess)
 
         return lax.cond(needed, step, lambda _: guess, None), ()
 
@@ -183,12 +218,33 @@ def _solve(residual: Callable[[Array], Array], guess: Array, needed: Array) -> A
     return root(residual, guess, newton, tangent_solve, label=REST)[0]
 
 
+def _conjugate_gradients(matvec: Callable[[Array], Array], b: Array) -> Array:
+    """x that makes |matvec(x) - b| least, by conjugate gradients on the normal equations; it does not need an inverse.
+
+    Source: A. Bjorck, Numerical Methods for Least Squares Problems, 1996, sect. 7.4.1 (CGLS).
+    """
+    transposed = jax.linear_transpose(matvec, b)
+
+    def one(state):
+        x, r, p, size, k = state
+        change = matvec(p)
+        alpha = size / jnp.sum(change**2)
+        x, r = x + alpha * p, r - alpha * change
+        (s,) = transposed(r)
+        new = jnp.sum(s**2)
+        return x, r, s + new / size * p, new, k + 1
+
+    (s,) = transposed(b)
+    first = jnp.sum(s**2)
+    enough = jnp.maximum(1e-10, jnp.finfo(b.dtype).eps) ** 2 * first
+    state = jnp.zeros_like(b), b, s, first, 0
+    return lax.while_loop(lambda state: (state[3] > enough) & (state[4] < ITERATIONS), one, state)[0]
+
+
 def _solve_linear(slope: Callable[[Array], Array], b: Array) -> Array:
     """slope^-1 b, by least squares; where contacts are redundant, some forces that do the same."""
     if b.size > DENSE_UP_TO:
-        from jax.scipy.sparse.linalg import bicgstab
-
-        return bicgstab(slope, b, tol=1e-9, maxiter=200)[0]
+        return lax.custom_linear_solve(slope, b, _conjugate_gradients, transpose_solve=_conjugate_gradients)
     n = b.size
     matrix = jax.vmap(lambda d: slope(d.reshape(b.shape)).ravel())(jnp.eye(n, dtype=b.dtype)).T
     small = 1e3 * jnp.finfo(b.dtype).eps * jnp.eye(n, dtype=b.dtype)

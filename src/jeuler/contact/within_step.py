@@ -12,11 +12,12 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from jeuler._core.vectors import length
+from jeuler._jax.anywhere import anywhere
 from jeuler._jax.found import found, found_p
 from jeuler.contact.contacts import Contacts, Look
 from jeuler.contact.impacts import go_through, impulsive_limit, schedule
 from jeuler.contact.paths import Path, free_path, share_of_the_force
-from jeuler.contact.rest import REST, Problem, at_rest
+from jeuler.contact.rest import REST, Problem, at_rest, together
 
 IMPACTS = "impacts"  # the name of what the search of a step has found
 
@@ -51,8 +52,31 @@ def _resolve(
     touched = (touched | after.hit)[:, None]
     position = jnp.where(touched, moved, x_free)
     velocity = jnp.where(touched, v_end + jump, v_free)
+    if len(contacts.colliders) > 1 or len(contacts.i):
+        kick, shift = lax.cond(
+            anywhere(left > 0), settle, no_change, *lax.stop_gradient((contacts, after, velocity, slow))
+        )
+        position, velocity = position + shift, velocity + kick
     position = jnp.where(lost[:, None], jnp.nan, position)  # a surface that cannot say where it is: announced
     return position, velocity, unresolved + left + contacts.left_out
+
+
+def settle(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tuple[Array, Array]:
+    """What brings to rest together all that touches at the end of a step which had more impacts than are followed.
+
+    Changes of velocity and position, (particle, dim). They are not differentiated: the impacts are counted.
+    """
+    end = contacts.look(path, jnp.ones_like(contacts.both(jnp.add, path.s)))
+    small = contacts.roundoff(path.x)
+    touches = (end.gap <= small + 1e-3 * slow) & contacts.possible()
+    speed = contacts.relative(velocity) + end.recession[:, None] * end.normal
+    gap = end.gap / contacts.dt
+    problem = Problem(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
+    return together(problem, small)
+
+
+def no_change(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tuple[Array, Array]:
+    return jnp.zeros_like(velocity), jnp.zeros_like(velocity)
 
 
 def _slow(contacts: Contacts, dv: Array) -> Array:
@@ -74,7 +98,7 @@ def answer(contacts: Contacts, x: Array, v: Array, acceleration: Array) -> Calla
 
     def kick(u):
         velocity = contacts.relative(u) + recession[:, None] * normal
-        return at_rest(Problem(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays), small).kick
+        return at_rest(Problem(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0), small).kick
 
     return kick
 
@@ -92,9 +116,10 @@ def hold(
     (gap, _, normal, recession, _), small, stays = at_start(contacts, free_path(x, displacement, dv, contacts.dt), slow)
     end_speed = contacts.relative(v + dv) + recession[:, None] * normal
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
-    rest = at_rest(Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays), small)
-    overlaps = jnp.sum(rest.on & (rest.gap < -small - 1e-6 * contacts.both(jnp.add, contacts.radius)))
-    unresolved = rest.unresolved + overlaps.astype(jnp.int32)
+    rest = at_rest(Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt), small)
+    radius = contacts.both(jnp.add, contacts.radius)
+    unclear = stays & (radius > 0) & (small > 0.05 * radius)  # far from the origin nobody can say whether they touch
+    unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | unclear).astype(jnp.int32)
     touched = _touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1)
     contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
@@ -109,7 +134,13 @@ def at_start(contacts: Contacts, path: Path, slow: Array) -> tuple[Look, Array, 
     start = contacts.look(path, jnp.zeros_like(contacts.both(jnp.add, path.s)))
     small = contacts.roundoff(path.x)
     slowly = -start.slope <= impulsive_limit(contacts, start.normal, path) + slow
-    return start, small, lax.stop_gradient((start.gap <= small) & slowly & contacts.possible())
+    touches = start.gap <= small + 1e-3 * slow  # what the solve of the step before may have left open
+    return start, small, lax.stop_gradient(touches & slowly & contacts.possible())
+
+
+def is_deep(contacts: Contacts, gap: Array, small: Array) -> Array:
+    """Whether an overlap, (contact,), is more than rounding."""
+    return gap < -2 * small - 1e-6 * contacts.both(jnp.add, contacts.radius)
 
 
 def _touched(contacts: Contacts, on: Array) -> Array:
