@@ -430,6 +430,7 @@ OPTIONS = {
     "--drag": ("linear", "", "0.1"),
     "--plot": ("pic", "a.exe", "nodir/a.png", "", "folder", "x.txt"),
     "--json": ("nodir/a.json", "", "folder"),
+    "--report": ("nodir/a.html", "", "folder"),
     "--max-iterations": ("0", "-1", "a", "1.5", "", "nan"),
     "--input": ("force", "x", ""),
 }  # fmt: skip
@@ -467,7 +468,7 @@ def commands(count, folder, seed=20240229):
     lines += [
         ["fit", "good.csv", f"{option}={values[0]}", f"{option}={values[1]}"] for option, values in OPTIONS.items()
     ]
-    lines += [["fit", "good.csv", "good.csv"], ["fits", "good.csv"], ["good.csv"], [], ["look"], ["fit", "good.csv", "--plot", "good.csv"], ["fit", "good.csv", "--json", "good.csv"]]  # fmt: skip
+    lines += [["fit", "good.csv", "good.csv"], ["fits", "good.csv"], ["good.csv"], [], ["look"], ["fit", "good.csv", "--plot", "good.csv"], ["fit", "good.csv", "--json", "good.csv"], ["fit", "good.csv", "--report", "good.csv"], ["fit", "good.csv", "--report", "-", "--json", "-"]]  # fmt: skip
     lines += [["fit", "good.csv", "--mass", "0.5", "--mass", "0.7"], ["fit", "good.csv", "--dt=0.01", "--dt=0.02"]]
     return {" ".join(map(repr, line)): line for line in rng.sample(lines, min(count, len(lines)))}
 

@@ -1,3 +1,1 @@
 """Checks, pytrees and vectors: imports JAX and NumPy, and no other package of jeuler."""
-
-"""Checks, pytrees and vectors: imports JAX and NumPy, and no other package of jeuler."""

@@ -1,3 +1,1 @@
 """Everything that depends on JAX internals: the one package to check when JAX changes."""
-
-"""Everything that depends on JAX internals: the one package to check when JAX changes."""

@@ -1,3 +1,1 @@
 """What the shell does: ``python -m jeuler``."""
-
-"""What the shell does: ``python -m jeuler``."""
