@@ -51,7 +51,11 @@ def programs(shape, step):
         state = jeuler.ParticleState(position, velocity, mass, alive=alive if pairs else None)
         solution = jeuler.simulate(scene, state, dt=dt, num_steps=STEPS, save_every=STEPS, step=step)
         end = solution.y
-        return jnp.sum(end.position[-1] + 0.1 * end.velocity[-1]), (end.position[-1], solution.first_nonfinite)
+        return jnp.sum(end.position[-1] + 0.1 * end.velocity[-1]), (
+            end.position[-1],
+            solution.first_nonfinite,
+            solution.unresolved_contacts,
+        )
 
     of_one = jax.value_and_grad(run, has_aux=True)
     return run, jax.jit(of_one), jax.jit(jax.vmap(of_one))
@@ -114,7 +118,7 @@ def test_nothing_is_lost_unannounced_and_all_ways_to_run_agree(shape, step, dtyp
     @hypothesis.given(strategies.integers(0, 2**32 - 1))
     def check(seed):
         scenes, alive = random_scenes(shape, dtype, seed)
-        (_, (position, lost)), gradient = jax.tree.map(np.asarray, of_many(scenes, alive))
+        (_, (position, lost, unresolved)), gradient = jax.tree.map(np.asarray, of_many(scenes, alive))
         random = np.random.default_rng(seed)
         nearby = [
             tuple(x * (1 + 8 * eps * random.choice([-1, 1], x.shape)).astype(dtype) for x in scenes) for _ in "abc"
@@ -128,9 +132,10 @@ def test_nothing_is_lost_unannounced_and_all_ways_to_run_agree(shape, step, dtyp
             result, mine = (position[k], [g[k] for g in gradient]), [np.asarray(x[k]) for x in scenes]
             change = [largest_change(result, (o[0][1][0][k], [g[k] for g in o[1]]), mine) for o in others]
             # on the edge of a contact, or far over the stability limit, roundoff decides where a scene goes
-            if checks and np.max(change) < 1e3 * eps:
+            # and so it does where contacts are counted as not resolved
+            if checks and np.max(change) < 1e3 * eps and unresolved[k] == 0:
                 steady.append(jax.tree.map(lambda x, k=k: x[k], (scenes, alive)))
-                (_, (alone, lost_alone)), gradient_alone = of_one(*steady[-1])
+                (_, (alone, lost_alone, _)), gradient_alone = of_one(*steady[-1])
                 assert lost_alone < 0, here
                 by_itself = jax.tree.map(np.asarray, (alone, list(gradient_alone)))
                 assert largest_change(result, by_itself, mine) < 1e5 * eps, here
@@ -145,7 +150,7 @@ def test_nothing_is_lost_unannounced_and_all_ways_to_run_agree(shape, step, dtyp
         np.testing.assert_allclose(eager, of_one(*steady[0])[0][0], rtol=1e2 * eps)
     if shape == "pool with dead slots":  # a dead slot stays empty and has no gradient
         scenes, alive = random_scenes(shape, dtype, 7)
-        (_, (position, lost)), gradient = jax.tree.map(np.asarray, of_many(scenes, alive))
+        (_, (position, lost, _)), gradient = jax.tree.map(np.asarray, of_many(scenes, alive))
         assert not position[~np.asarray(alive)].any()
         dead_and_finite = ~np.asarray(alive) & (lost < 0)[:, None]
         assert all(not leaf[dead_and_finite].any() for leaf in gradient[:3])

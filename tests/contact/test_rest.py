@@ -163,3 +163,23 @@ def test_ball_that_is_hit_off_the_floor_falls_from_then_on():
     end = run(contact, *start, dt=2 * half, num_steps=1, step=jeuler.rk4_step)
     np.testing.assert_allclose(end.y.velocity[-1, 0], way + half * g, atol=1e-12)
     np.testing.assert_allclose(end.y.position[-1, 0], [0.8 * half, 0.1 + 0.6 * half - 4.9 * half**2], atol=1e-12)
+
+
+def test_a_scene_does_not_depend_on_the_others_of_its_batch():
+    """One of two has more impacts in a step than are followed, and is brought to rest; the other is not touched by it."""
+    pairs = [(0, 1), (1, 2)]
+
+    def end(x, v):
+        scene = jeuler.Scene(effects=(jeuler.Collisions(pairs=pairs, radius=0.1, restitution=1.0, max_bounces=1),))
+        run = jeuler.simulate(scene, jeuler.ParticleState(x, v), dt=0.1, num_steps=4, save_every=4)
+        return run.y.position[-1], run.unresolved_contacts
+
+    apart = [[0.0, 0.0], [0.35, 0.0], [5.0, 0.0]]
+    crowded = [[0.0, 0.0], [0.2, 0.0], [0.4, 0.0]]
+    calm, wild = [[1.0, 0.0], [-1.0, 0.0], [0.0, 0.0]], [[40.0, 0.0], [0.0, 0.0], [-40.0, 0.0]]
+    x, v = jnp.array([apart, crowded]), jnp.array([calm, wild])
+    together, counts = jax.jit(jax.vmap(end))(x, v)
+    alone, count = jax.jit(end)(x[0], v[0])
+    assert (int(count), int(counts[0])) == (0, 0)
+    assert counts[1] > 0
+    np.testing.assert_allclose(together[0], alone, rtol=1e-13, atol=1e-13)

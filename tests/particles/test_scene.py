@@ -377,8 +377,8 @@ def test_scene_wants_tuples():
 
 
 FALLING = ParticleState(jnp.ones((1, 2)), jnp.zeros((1, 2)))
-FORCES = (jeuler.Gravity([0.0, -9.8]),)
-BOUNCING = Scene(FORCES, (jeuler.Collisions((jeuler.Plane([0.0, 0.0], [0.0, 1.0]),)), jeuler.SpeedLimit(5.0)))
+GRAVITY = (jeuler.Gravity([0.0, -9.8]),)
+BOUNCING = Scene(GRAVITY, (jeuler.Collisions((jeuler.Plane([0.0, 0.0], [0.0, 1.0]),)), jeuler.SpeedLimit(5.0)))
 
 
 def test_a_vector_field_without_the_effects_of_its_scene_says_so():
@@ -395,10 +395,10 @@ def test_a_vector_field_that_is_all_of_its_scene_is_silent():
         warnings.simplefilter("error")
         motion = FALLING.position, FALLING.velocity
         assert BOUNCING.without_effects().vector_field(0.0, motion, 1.0)[1].tolist() == [[0.0, -9.8]]
-        for scene in (Scene(FORCES), Scene(FORCES, (hand,))):
+        for scene in (Scene(GRAVITY), Scene(GRAVITY, (hand,))):
             assert scene.without_effects() is scene
             jeuler.solve(scene.vector_field, motion, args=1.0, dt=0.1, num_steps=1)
-        assert Scene(FORCES, (hand, *BOUNCING.effects)).without_effects().effects == (hand,)
+        assert Scene(GRAVITY, (hand, *BOUNCING.effects)).without_effects().effects == (hand,)
         jeuler.simulate(BOUNCING, FALLING, dt=0.1, num_steps=1)
         jeuler.stability_limit(BOUNCING, FALLING)
         jeuler.advise_step(BOUNCING, FALLING, t1=0.1, error=0.1)

@@ -56,7 +56,8 @@ def _resolve(
         kick, shift = lax.cond(
             anywhere(left > 0), settle, no_change, *lax.stop_gradient((contacts, after, velocity, slow))
         )
-        position, velocity = position + shift, velocity + kick
+        mine = left > 0  # under vmap it is worked out for all members if one has need of it
+        position, velocity = position + jnp.where(mine, shift, 0), velocity + jnp.where(mine, kick, 0)
     position = jnp.where(lost[:, None], jnp.nan, position)  # a surface that cannot say where it is: announced
     return position, velocity, unresolved + left + contacts.left_out
 
