@@ -52,8 +52,8 @@ def work_precision(
 
     The steps are equal: each dt becomes the nearest one that divides t1 - t0. One program serves all step sizes of a
     method, and one all its tolerances; a gradient has one for each row. Each is compiled ahead (compile seconds apart),
-    run once unmeasured, then measured ``repeats`` times. A run that blows up, or that would take longer than
-    ``timeout`` by the speed of its first steps, is a row of NaN with its reason.
+    run once unmeasured, then measured ``repeats`` times, or as often as fits into 1 s, at least once. A run that blows
+    up, or that would take longer than ``timeout`` by the speed of its first steps, is a row of NaN with its reason.
 
     To add a method later, or put several problems in one table, add tables: ``table + work_precision(...)``.
 
@@ -78,7 +78,7 @@ def work_precision(
         where a diffrax solver chooses its own steps what it interpolates.
       gradient: a scalar function of the final state; each row then also has the error, seconds and bytes of its
         reverse-mode derivative with respect to args.
-      repeats: measured runs in each row.
+      repeats: most measured runs in each row.
       timeout: longest run allowed, s.
       adjoint: how diffrax differentiates, a ``diffrax.AbstractAdjoint``; None takes its default.
       problem: a name for the problem, to tell it from others in one table.

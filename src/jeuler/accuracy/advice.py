@@ -35,7 +35,7 @@ class StepAdvice:
     """What `advise_step` found.
 
     Attributes:
-      dt: the step size to use, s, a whole part of t1 - t0; NaN if not feasible.
+      dt: the step size to use, s, t1 - t0 over a whole number of steps; NaN if not feasible.
       num_steps: steps of that size from t0 to t1; 0 if not feasible.
       predicted_error: the error at t1 to expect at that dt, in the terms of the target; if not feasible, the
         least error known to be within reach, or NaN.
@@ -110,8 +110,8 @@ def advise_step(
       relative: the target is relative to the norm of the state at t1 (True), or in the units of the state (False).
       compensated: advise for compensated sums.
       breaks: times at which f may jump, s, t0 and t1 among them, for a run with the same `solve(..., breaks=)`.
-      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work, and a
-        sixteenth of that for steps that solve equations.
+      max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work, a
+        sixteenth of that for steps that solve equations, and never less than 4,096.
     Returns: `StepAdvice`; it refuses, ``feasible=False`` with the reason, rather than guess.
     Raises: ValueError, naming the argument, what was expected and what came.
     Example:

@@ -56,7 +56,7 @@ class Candidate:
 
     @property
     def program_size(self) -> float:
-        """About how many times the compilation of an explicit adaptive run its own takes, if it solves equations."""
+        """About its compile time over that of an explicit adaptive run, if it solves equations; 0 if it does not."""
         if is_diffrax(self.step):
             import diffrax
 

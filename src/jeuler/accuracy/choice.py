@@ -160,10 +160,9 @@ def advise_method(
     Each method runs as `solve`, `solve_adaptive` or ``diffrax.diffeqsolve`` would run it, in the precision of y0,
     keeping the last state only; seconds are those of a compiled run, the least of several. Its number of steps is
     doubled, or its tolerance tightened, until the error against an accurate adaptive run meets the target, and is then
-    narrowed down.
-    A method that would take longer than 6 times the fastest so far is not run to the end: its dt and seconds are
-    predicted by its order where the errors have been seen to follow it, and else it has none, with the reason. The
-    methods within a factor 3 of the fastest are timed again at the end, in turns.
+    narrowed down. A method that would take longer than 6 times the fastest so far, and than 20 ms, is not run to the
+    end: its dt and seconds are predicted by its order where the errors have been seen to follow it, and else it has
+    none, with the reason. The methods within a factor 3 of the fastest are timed again at the end, in turns.
 
     The accurate run is that of `solve_adaptive` in float64 at two tolerances that agree to a twentieth of the target;
     for stiff equations, by an extrapolated linearly implicit step.

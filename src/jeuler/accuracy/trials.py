@@ -32,7 +32,7 @@ REPEATED = 2e-3  # s: a shorter run is timed several times
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """One run: the number of steps or rtol that it was given, the steps it took, its error and its seconds."""
+    """One run: its setting (the number of steps, or rtol and atol), the steps it took, its error and its seconds."""
 
     setting: Any
     num_steps: int
@@ -221,7 +221,7 @@ def nothing(runs: list[Outcome], reason: str) -> Found:
 
 
 def loosest(trial: Trial, target: Target, part: float) -> Found:
-    """The loosest tolerance, tightened by factors of 4, then loosened by 2."""
+    """The loosest tolerance that meets the target: tightened by factors of 4, then once loosened by 2."""
 
     def run(rtol: float) -> Outcome:
         tolerances = tuple(float(f"{x:.3g}") for x in (rtol, rtol * part * target.size))

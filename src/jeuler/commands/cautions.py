@@ -17,18 +17,18 @@ LARGE_ANGLE = 0.35  # rad: the period of a pendulum is 0.8 % longer there
 
 
 def cautions(measured: Measurement, found: Estimate, guess: Oscillation, mass_given: bool) -> list[str]:
-    """All sentences that apply."""
-    told = [*measured.warnings]
+    """The warnings that apply to this fit, one sentence each."""
+    sentences = [*measured.warnings]
     if not mass_given:
-        told.append(
-            "No --mass was given: 1 kg is assumed for each particle. ks and kd are per kilogram then; give --mass."
+        sentences.append(
+            "No --mass was given: 1 kg is assumed for each particle, so ks and kd are per kilogram; give --mass."
         )
-    told += _sampling_words(measured, guess)
-    told += _motion_words(measured, found, guess)
-    told += _residual_words(measured, found, guess)
-    told += _parameter_words(found)
-    told += _step_words(found)
-    return told
+    sentences += _sampling_words(measured, guess)
+    sentences += _motion_words(measured, found, guess)
+    sentences += _residual_words(measured, found, guess)
+    sentences += _parameter_words(found)
+    sentences += _step_words(found)
+    return sentences
 
 
 def _sampling_words(measured: Measurement, guess: Oscillation) -> Iterator[str]:
@@ -40,13 +40,13 @@ def _sampling_words(measured: Measurement, guess: Oscillation) -> Iterator[str]:
     repeated = measured.sampling.repeated if measured.sampling else 0
     if repeated:
         yield (
-            f"{repeated} rows repeat the time of the row before: a clock too coarse or doubled rows; export more "
-            f"decimals of the time."
+            f"{repeated} rows repeat the time of the row before: the clock is too coarse, or rows are duplicated; "
+            f"export the time with more decimals."
         )
     if step > period / 4:
         yield (
-            f"There are {period / step:.1f} samples a period: a faster motion would look the same (aliasing); "
-            f"record at {4 / period:.3g} Hz or more, or make sure of the frequency otherwise."
+            f"There are only {period / step:.1f} samples per period: a faster motion would look the same (aliasing); "
+            f"record at {4 / period:.3g} Hz or more, or confirm the frequency by other means."
         )
 
 
@@ -63,24 +63,26 @@ def _motion_words(measured: Measurement, found: Estimate, guess: Oscillation) ->
     held = _held(measured.times, flat)
     if held > period / 6 and not model.drive:
         yield (
-            f"The first {held:.2g} s stand still: the release is in the record, the model starts free; "
+            f"Nothing moves in the first {held:.2g} s: the release is in the record, but the model starts free; "
             f"use --from {measured.times[0] + held + period / 4:.3g}."
         )
     if not model.pairs and model.drive is None:
         known = [mode.angular_frequency for mode in found.modes]
         width = 2 * np.pi / float(np.ptp(measured.times))
         lines = {round(o, 6): a for column in flat.T for o, a in strong_lines(measured.times, column)}
-        strange = [o for o in lines if all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))]
-        if strange:
-            frequencies = listed([f"{o / (2 * np.pi):.3g} Hz" for o in sorted(strange)])
+        unexplained = [
+            o for o in lines if all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))
+        ]
+        if unexplained:
+            frequencies = listed([f"{o / (2 * np.pi):.3g} Hz" for o in sorted(unexplained)])
             yield (
-                f"The data hold another oscillation, at {frequencies}, that the model lacks: add the particles and "
-                f"springs that make it (--edges), fit a direction alone (--columns), or cut it out (--from, --to)."
+                f"The data contain another oscillation, at {frequencies}, that the model lacks: add the particles and "
+                f"springs that cause it (--edges), fit one direction (--columns), or leave it out (--from, --to)."
             )
 
 
 def _held(times: np.ndarray, flat: np.ndarray) -> float:
-    """How long the motion stands still at the beginning, s."""
+    """How long nothing moves at the beginning, s."""
     extent = np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0)
     moving = flat[:, extent >= 0.3 * np.nanmax(extent)]
     start = np.nanmedian(moving[:5], axis=0)
@@ -99,17 +101,17 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
     if far.size and share > LARGE_RESIDUAL / 20:
         yield (
             f"{far.size} rows lie far from the model, the first at {measured.times[far[0]]:.4g} s: a knock, a lost "
-            f"point or a damaged cell; look there, and cut it out or empty the cells."
+            f"point or a damaged cell; look at those rows, and leave them out or empty their cells."
         )
     if share > 0.7:
         yield (
-            f"The model explains {max(0.0, 100 * (1 - share**2)):.0f} % of the variance only: its numbers mean "
-            f"nothing. Look at the picture and at `jeuler look`; choose columns, run or span."
+            f"The model explains only {max(0.0, 100 * (1 - share**2)):.0f} % of the variance: its numbers mean "
+            f"nothing. Look at the picture and at `jeuler look`; choose other columns, another run or span."
         )
         return
     if share > LARGE_RESIDUAL and lag > 0.5:
         yield (
-            f"The residual is {100 * share:.2g} % of the motion's spread and not noise (neighbours correlate by "
+            f"The residual is {100 * share:.2g} % of the motion's spread and is not noise (neighbours correlate by "
             f"{lag:.2f}): the model lacks something. Try --friction compare; look at the picture for a second motion, "
             f"a release, a knock, or a drift."
         )
@@ -118,13 +120,13 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
         begin, rest = np.sqrt(np.nanmean(residual[early] ** 2)), np.sqrt(np.nanmean(residual[~early] ** 2))
         if begin > 4 * rest and share > LARGE_RESIDUAL / 4:
             yield (
-                f"The first half period fits {begin / rest:.0f} times worse than the rest: a release or a hand may be "
-                f"in it; use --from {measured.times[~early][0]:.3g}."
+                f"The first half period fits {begin / rest:.0f} times worse than the rest: it may hold the "
+                f"release; use --from {measured.times[~early][0]:.3g}."
             )
 
 
 def _far(residual: np.ndarray) -> np.ndarray:
-    """The few rows whose residual is more than 8 times what is usual, by the median."""
+    """The rows whose residual is over 8 times the median; none if these are more than 5 % of all."""
     size = np.nanmax(np.abs(residual), axis=1, initial=0, where=np.isfinite(residual))
     usual = np.median(size[size > 0]) if (size > 0).any() else 0.0
     far = np.flatnonzero(size > 8 * usual)
@@ -133,16 +135,16 @@ def _far(residual: np.ndarray) -> np.ndarray:
 
 def _parameter_words(found: Estimate) -> Iterator[str]:
     if not found.converged:
-        yield "The fit did not converge: raise --max-iterations, or give a start near the truth with --start."
+        yield "The fit did not converge: raise --max-iterations, or give better starting values with --start."
     ks = np.atleast_1d(found.params["ks"])
     if (ks < 0).any():
         yield "A stiffness came out negative: the model is wrong for these data; look at the columns and --edges."
     for what in found.at_zero:
-        yield f"The best {what} would be negative; it is held at 0: the data show none, or the model lacks a drive."
+        yield f"The best {what} would be negative, so it is held at 0: the data show none, or the model lacks a drive."
 
 
 def _step_words(found: Estimate) -> Iterator[str]:
-    """The damping of the fourth-order Runge-Kutta step itself, omega (omega dt)^5 / 144, against the error of kd."""
+    """The decay rate that the fourth-order Runge-Kutta step adds, omega (omega dt)^5 / 144, against the error of kd."""
     if "kd" not in found.params or found.model.places:
         return
     omega = max(mode.angular_frequency for mode in found.modes)
@@ -150,13 +152,13 @@ def _step_words(found: Estimate) -> Iterator[str]:
     kd, errors = np.atleast_1d(found.params["kd"]), np.atleast_1d(found.stderr["kd"])
     if bias > max(float(np.min(errors)), 1e-3 * float(np.min(np.abs(kd)))):
         yield (
-            f"The step of {found.dt:.3g} s damps the model by itself: kd is too small by {bias:.2g}; "
+            f"The step of {found.dt:.3g} s adds damping of its own: kd comes out too small by {bias:.2g}; "
             f"give --dt {found.dt / 2:.3g}."
         )
 
 
 def lag_one(residual: np.ndarray) -> float:
-    """The correlation of neighbours, averaged over the columns by their sizes."""
+    """The correlation of neighbouring samples, over all columns, weighted by their variances."""
     centred = residual - np.nanmean(residual, axis=0)
     products, squares = np.nansum(centred[1:] * centred[:-1]), np.nansum(centred**2)
     return float(products / squares) if squares > 0 else 0.0

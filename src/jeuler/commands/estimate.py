@@ -20,7 +20,7 @@ from jeuler.fitting.spectrum import strong_lines
 from jeuler.fitting.unknowns import Layout, readable
 from jeuler.particles.scene import Scene
 
-STEPS_A_PERIOD, FEWER_STEPS = 80, 40  # the second where the first would be more than MANY_STEPS
+STEPS_A_PERIOD, FEWER_STEPS = 80, 40  # FEWER_STEPS where the run would take more than MANY_STEPS in all
 MANY_STEPS = 100_000
 MOST_STEPS = 1_000_000
 NOT_NEGATIVE = ("kd", "quadratic", "dry")
@@ -28,12 +28,12 @@ NOT_NEGATIVE = ("kd", "quadratic", "dry")
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What was found.
+    """The result of a fit.
 
     Attributes:
       model, params: the model and its parameters.
       stderr: of the same structure, for residuals correlated as these are; inf where not determined.
-      widening: by how much the errors for white residuals were multiplied.
+      widening: the factor by which standard errors are larger than for white residuals.
       at_zero: the parameters that ended at their bound 0, in words.
       predicted: at the measured times, (time, particle, dim).  dt: step size, s.
       loss: mean square of the residual.  iterations, converged, message: of the descent.  scene, mass: as fitted.
@@ -58,7 +58,7 @@ class Estimate:
 
     @property
     def modes(self) -> list[Mode]:
-        """Modes of the linear part of the model; about the mean of the motion where positions are places."""
+        """Modes of the linear part of the model; about the mean position where positions are places."""
         if not self.model.places:
             ks = np.atleast_1d(self.params["ks"])
             kd = np.atleast_1d(self.params.get("kd", np.zeros_like(ks)))
@@ -78,7 +78,7 @@ def guess_of(measured: Measurement) -> Oscillation:
 
 
 def step_size(measured: Measurement, guess: Oscillation, asked: float | None) -> float:
-    """An 80th of the shortest period, a 40th in a very long record, a 100th of the record at most."""
+    """An 80th of the shortest period, a 40th in a very long record; at most a 100th of the record. Or as asked."""
     flat = measured.positions.reshape(len(measured.times), -1)
     lines = [omega for column in flat.T for omega, _ in strong_lines(measured.times, column)]
     period = 2 * np.pi / max([guess.angular_frequency, *(o for o in lines if o < 8 * guess.angular_frequency)])
@@ -98,7 +98,7 @@ def step_size(measured: Measurement, guess: Oscillation, asked: float | None) ->
 def starting_values(
     model: Model, measured: Measurement, guess: Oscillation, asked: dict[str, float]
 ) -> tuple[dict[str, Any], bool]:
-    """Where the descent begins, and whether it should grow the horizon as it is far from a linear model."""
+    """Where the search starts, and whether it should lengthen the fitted time in stages, as the model is not linear."""
     mean_mass = float(np.nanmean(model.mass))
     springs = 1 if (model.shared or model.pendulum or model.cubic) else len(model.labels)
     omega = guess.angular_frequency
@@ -152,7 +152,7 @@ def _places(model: Model, measured: Measurement) -> dict[str, Any]:
 def estimate(
     model: Model, measured: Measurement, guess: Oscillation, dt: float, asked: dict[str, float], max_iterations: int
 ) -> Estimate:
-    """Fit the model; what becomes negative and cannot be is put at 0 and the rest fitted again."""
+    """Fit the model; coefficients that come out negative and cannot be are held at 0, and the rest is fitted again."""
     start, grow = starting_values(model, measured, guess, asked)
     unknowns, samples = sum(np.size(x) for x in start.values()), int(np.isfinite(measured.positions).sum())
     if samples <= unknowns:
@@ -198,15 +198,15 @@ def estimate(
 def _held_words(model: Model, held: dict[str, Any]) -> tuple[str, ...]:
     """What is held at 0, in words."""
     words = {"quadratic": "quadratic drag", "dry": "dry friction"}
-    told = [words[name] for name in words if np.any(held.get(name, False))]
+    names = [words[name] for name in words if np.any(held.get(name, False))]
     springs = [label for label, mask in zip(model.labels, np.atleast_1d(held.get("kd", False)), strict=False) if mask]
     if springs:
-        told.append("damping kd" + (f" of {', '.join(springs)}" if len(model.labels) > 1 else ""))
-    return tuple(told)
+        names.append("damping kd" + (f" of {', '.join(springs)}" if len(model.labels) > 1 else ""))
+    return tuple(names)
 
 
 def _scales(model: Model, measured: Measurement, guess: Oscillation, start: dict[str, Any]) -> dict[str, Any]:
-    """A large but sensible change of each parameter."""
+    """The typical size of a change of each parameter."""
     ks = float(np.max(start["ks"]))
     omega = guess.angular_frequency
     spread = float(np.nanstd(measured.positions)) or 1.0
@@ -261,7 +261,7 @@ def _descend(
 
 
 def _widening(found: Any) -> float:
-    """By how much the errors of ks are larger than for white residuals."""
+    """The factor by which the errors of ks are larger than for white residuals; the largest of all springs."""
     wide, white = (np.ravel(errors["ks"]) for errors in (found.stderr, found.stderr_white))
     known = np.isfinite(wide) & np.isfinite(white) & (white > 0)
     return float(np.max(wide[known] / white[known])) if known.any() else 1.0

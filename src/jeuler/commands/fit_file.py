@@ -48,10 +48,10 @@ def fit_file(arguments: argparse.Namespace, started: float) -> None:
     dt = step_size(measured, guess, arguments.dt)
     found, compared = _fit(arguments, model, measured, guess, dt)
     warnings = cautions(measured, found, guess, arguments.mass is not None or not arguments.files)
-    told = report(measured, found, warnings)
+    result = report(measured, found, warnings)
     if compared:
-        told["comparison"] = compared
-    _write_outputs(arguments, measured, found, picture, told, started)
+        result["comparison"] = compared
+    _write_outputs(arguments, measured, found, picture, result, started)
 
 
 def _measured(arguments: argparse.Namespace) -> Measurement:
@@ -115,7 +115,7 @@ def _model(arguments: argparse.Namespace, measured: Measurement, mass: np.ndarra
 def _fit(
     arguments: argparse.Namespace, model: Model, measured: Measurement, guess: Oscillation, dt: float
 ) -> tuple[Estimate, list[dict[str, Any]]]:
-    """The fit, or with ``--friction compare`` the best of the frictions by the Bayesian information criterion."""
+    """The fit, or with ``--friction compare`` the best of the friction laws by the Bayesian information criterion."""
     asked = options.start(arguments.start)
     if arguments.friction != "compare":
         return estimate(model, measured, guess, dt, asked, arguments.max_iterations), []
@@ -139,7 +139,7 @@ def _fit(
 
 
 def _check_outputs(files: list[str], asked: dict[str, str | None]) -> None:
-    """Refuse before the work what would be refused after it, or would destroy what was measured."""
+    """Refuse, before the fit, outputs that cannot be written or that would overwrite the recording."""
     outputs = {option: path for option, path in asked.items() if path is not None and path != STANDARD_OUTPUT}
     for option, path in outputs.items():
         try:
@@ -173,39 +173,39 @@ def _write_outputs(
     measured: Measurement,
     found: Estimate,
     picture: str,
-    told: dict[str, Any],
+    result: dict[str, Any],
     started: float,
 ) -> None:
-    """Picture, JSON and text; what goes to standard output goes there alone, the text to standard error then."""
+    """Write picture, report, JSON and text; where one goes to standard output, the text goes to standard error."""
     if picture == STANDARD_OUTPUT:
         with tempfile.TemporaryDirectory() as folder:
             path = os.path.join(folder, "fit.png")
-            draw(measured, found, path, told)
+            draw(measured, found, path, result)
             with open(path, "rb") as file:
                 sys.stdout.buffer.write(file.read())
     else:
-        draw(measured, found, picture, told)
+        draw(measured, found, picture, result)
     if arguments.report == STANDARD_OUTPUT:
-        sys.stdout.write(page(measured, found, told).html())
+        sys.stdout.write(page(measured, found, result).html())
     elif arguments.report is not None:
-        page(measured, found, told).write(arguments.report)
-    told["seconds"] = time.perf_counter() - started
+        page(measured, found, result).write(arguments.report)
+    result["seconds"] = time.perf_counter() - started
     if arguments.json is not None:
-        text = json.dumps(told, indent=2) + "\n"
+        text = json.dumps(result, indent=2) + "\n"
         if arguments.json == STANDARD_OUTPUT:
             sys.stdout.write(text)
         else:
             write_atomically(arguments.json, lambda path: _write_text(path, text))
     piped = STANDARD_OUTPUT in (picture, arguments.json, arguments.report)
     where = None if picture == STANDARD_OUTPUT else picture
-    printed = lines(told, where, example=not arguments.files)
-    print("\n".join(printed + _compared(told)), file=sys.stderr if piped else sys.stdout)
+    printed = lines(result, where, example=not arguments.files)
+    print("\n".join(printed + _compared(result)), file=sys.stderr if piped else sys.stdout)
 
 
-def _compared(told: dict[str, Any]) -> list[str]:
-    rows = sorted(told.get("comparison", []), key=lambda row: row["score"])
+def _compared(result: dict[str, Any]) -> list[str]:
+    rows = sorted(result.get("comparison", []), key=lambda row: row["score"])
     return [
-        f"  {'friction ' + row['friction']:<28} residual RMS {row['rms']:.4g} {told['unit']}, "
+        f"  {'friction ' + row['friction']:<28} residual RMS {row['rms']:.4g} {result['unit']}, "
         + ("the best" if k == 0 else f"worse by {row['score']:.3g}")
         + (" (over 10: clearly)" if row["score"] > 10 else "")
         for k, row in enumerate(rows)

@@ -1,4 +1,4 @@
-"""Forces of the models that the command line fits, beside those of `jeuler.forces`: signed, along one coordinate."""
+"""Forces of the models that the command line fits, beside those of `jeuler.forces`: coefficients of either sign."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class SignedQuadraticDrag:
 
 @component()
 class Driving:
-    """A measured force, known at times that are `step` apart.
+    """A measured force, sampled at times that are `step` apart, constant before and after.
 
     F = gain u(t), linear between the samples
     """

@@ -17,8 +17,8 @@ def network_start(model: Model, measured: Measurement, guess: Oscillation) -> tu
 
         integral of w'' m x  =  - sum over springs of ks integral of w (x_i - x_j) + kd integral of w' (x_i - x_j)
 
-    with bumps w = (1 - z^2)^4 that end in the record; both sides are linear in ks, kd, unknown masses and a constant.
-    Positions of particles on one line, on any even or uneven clock. ks, kd >= 0.
+    with bumps w = (1 - z^2)^4 that vanish at both ends; both sides are linear in ks, kd, unknown masses and a constant.
+    For particles on one line, sampled evenly or not. ks, kd >= 0.
     """
     from scipy.optimize import lsq_linear
 
@@ -46,7 +46,7 @@ def network_start(model: Model, measured: Measurement, guess: Oscillation) -> tu
                 stretch = source[:, i] - (source[:, j] if j is not None else 0.0)
                 matrix[particle, :, value] += sign * stretch
     for k in range(n):
-        matrix[k, :, 2 * len(springs) + len(free) + k] = half  # a constant force: the place of rest
+        matrix[k, :, 2 * len(springs) + len(free) + k] = half  # a constant force, which sets the rest position
         if k in free:
             matrix[k, :, 2 * len(springs) + int(np.searchsorted(free, k))] = second[:, k]
         else:
@@ -62,7 +62,7 @@ def network_start(model: Model, measured: Measurement, guess: Oscillation) -> tu
 
 
 def driven_start(model: Model, measured: Measurement, guess: Oscillation) -> dict[str, Any]:
-    """ks, kd, cubic and gain of one particle under a measured force, by the weak form; at rest at the beginning."""
+    """ks, kd, cubic and gain of one particle under a measured force, by the weak form; the initial velocity is 0."""
     half = max(np.pi / guess.angular_frequency, 4 * float(np.median(np.diff(measured.times))))
     t, x, u = measured.times, measured.positions[:, 0, 0], np.asarray(measured.drive)
     amplitude = np.nanmax(np.abs(x - np.nanmean(x)))
@@ -89,7 +89,7 @@ def driven_start(model: Model, measured: Measurement, guess: Oscillation) -> dic
 
 
 def band_limited(times: np.ndarray, samples: np.ndarray, finer: int = 8) -> tuple[np.ndarray, float, float]:
-    """A measured force on a clock ``finer`` times as fine, by a low-pass filter at the Nyquist frequency."""
+    """A measured force on a clock ``finer`` times as fine, by band-limited interpolation; its first time and step."""
     from scipy.signal import resample_poly
 
     step = float(np.ptp(times)) / (len(times) - 1)
@@ -139,7 +139,7 @@ def equation_of_motion(model: Model, ks: np.ndarray, kd: np.ndarray, mass: np.nd
 def state_start(
     model: Model, measured: Measurement, ks: np.ndarray, kd: np.ndarray, mass: np.ndarray
 ) -> dict[str, Any]:
-    """Initial position, velocity and offset of each particle with which the linear model comes nearest to the data."""
+    """Initial position, velocity and offset of each particle with which the linear model is nearest to the data."""
     n = model.particles
     system = equation_of_motion(model, ks, kd, mass)
     system = system + 1e-9 * np.abs(system).max() * np.diag(np.arange(2 * n))  # no two eigenvalues equal

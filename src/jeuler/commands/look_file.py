@@ -56,7 +56,7 @@ def _words(column: Column, values: np.ndarray) -> str:
     )
     axis = f" along {column.axis}" if column.axis and column.quantity in OBSERVED else ""
     gaps = f", {missing} missing" if missing else ""
-    return f"{column.quantity or 'not known what it is'}{axis}, {ranged}{converted}{gaps}"
+    return f"{column.quantity or 'unknown quantity'}{axis}, {ranged}{converted}{gaps}"
 
 
 def _chosen(measured: Measurement) -> list[str]:
@@ -76,7 +76,7 @@ def _chosen(measured: Measurement) -> list[str]:
 
 
 def small_picture(times: np.ndarray, values: np.ndarray) -> list[str]:
-    """A column over time in characters: each of the columns of characters shows the extent of its share of the time."""
+    """A plot in characters: each column of characters spans the least to the largest value in its part of the time."""
     edges = np.linspace(times[0], times[-1], WIDTH + 1)
     place = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, WIDTH - 1)
     low, high = np.nanmin(values), np.nanmax(values)
@@ -96,7 +96,7 @@ def small_picture(times: np.ndarray, values: np.ndarray) -> list[str]:
 
 
 def suggested(arguments: argparse.Namespace, measured: Measurement, recordings: list[Recording]) -> str:
-    """The fit command with the corrections that were given."""
+    """The fit command, with the options that were given."""
     words = ["python", "-m", "jeuler", "fit", arguments.file]
     for option, name in (
         ("--columns", "columns"),

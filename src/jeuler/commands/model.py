@@ -1,4 +1,4 @@
-"""The model that is fitted: particles on springs, their friction, and what is observed of them."""
+"""The model that is fitted: particles on springs, their friction, and the quantity that is observed."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Model:
       shared: all springs have one ks and one kd (recordings of one spring).
       spring_mass: the spring's own effective mass is fitted.
       slow: the speed below which dry friction is smoothed.
-      drive: samples of a measured force, (sample,), with time and step of the first; None without.
+      drive: samples of a measured force, (sample,), the time of the first, and the step between them; None without.
     Positions are displacements from rest, so that springs keep their sign through zero; only where particles in a plane
-    or in space are joined in pairs are they places, and rest lengths and anchors are fitted too (`places`).
+    or in space are joined in pairs are they places; rest lengths and anchors are then fitted too (`places`).
     """
 
     mass: np.ndarray
@@ -55,7 +55,7 @@ class Model:
 
     @property
     def particles(self) -> int:
-        """How many particles move."""
+        """The number of moving particles."""
         return len(self.mass)
 
     @property
@@ -71,7 +71,7 @@ class Model:
         return [f"{k + 1}-anchor" for k in self.anchored] + [f"{i + 1}-{j + 1}" for i, j in self.pairs]
 
     def masses(self, params: dict[str, Any]) -> Any:
-        """Mass of each particle, with what is fitted put in."""
+        """Mass of each particle, with the fitted values in place of NaN and the mass of the spring added."""
         mass = jnp.asarray(self.mass)
         if "mass" in params:
             mass = mass.at[np.flatnonzero(np.isnan(self.mass))].set(params["mass"])
@@ -150,5 +150,5 @@ class Model:
 
 
 def steps_to(measured: Measurement, dt: float) -> int:
-    """How many steps reach the last time."""
+    """The number of steps that reach the last time."""
     return max(1, int(np.ceil(np.ptp(measured.times) / dt * (1 - 1e-12))))

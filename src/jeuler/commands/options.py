@@ -1,4 +1,4 @@
-"""What was measured, and what the options of the command line say about it: files and texts to arrays."""
+"""The options of the command line, from text to numbers; and the built-in example."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EXAMPLE = {"mass": 0.5, "ks": 20.0, "kd": 0.3, "rest": 0.1, "noise": 0.001}
 
 
 def example() -> Measurement:
-    """A damped spring, solved by diffrax to 1e-10 and given noise: data that the fit's own steps did not make."""
+    """A damped spring, solved by diffrax to 1e-10, with noise: data that the fit's own steps did not make."""
     import diffrax
     import jax.numpy as jnp
 
@@ -79,7 +79,7 @@ def edges(text: str | None, particles: int) -> tuple[list[tuple[int, int]], list
             )
         edge = tuple(sorted(ends)) if len(ends) == 2 else ends[0]
         if edge in (pairs if len(ends) == 2 else anchored):
-            raise ValueError(f"--edges names the spring {part.strip()!r} twice; its ks would be divided by chance")
+            raise ValueError(f"--edges names the spring {part.strip()!r} twice; its ks would be split arbitrarily")
         if isinstance(edge, tuple):
             pairs.append((edge[0], edge[1]))
         else:
@@ -88,7 +88,7 @@ def edges(text: str | None, particles: int) -> tuple[list[tuple[int, int]], list
 
 
 def start(text: str | None) -> dict[str, float]:
-    """ks=20,kd=0.3 as numbers."""
+    """``ks=20,kd=0.3`` as a dictionary."""
     start = {}
     for part in text.split(",") if text is not None else []:
         found = re.fullmatch(r"\s*(ks|kd)\s*=\s*(\S+)\s*", part)
@@ -102,7 +102,7 @@ def start(text: str | None) -> dict[str, float]:
 
 
 def frictions(text: str | None) -> tuple[str, ...]:
-    """viscous+dry as a tuple of kinds."""
+    """``viscous+dry`` as a tuple of kinds."""
     kinds = tuple(part.strip() for part in (text or "viscous").split("+"))
     if not all(kind in FRICTIONS for kind in kinds) or len(set(kinds)) < len(kinds):
         raise ValueError(
@@ -112,6 +112,6 @@ def frictions(text: str | None) -> tuple[str, ...]:
 
 
 def check_number(option: str, value: float | None, positive: bool = False) -> None:
-    """A finite number, above 0 where it must be."""
+    """One ValueError if an option is not a finite number, or not above 0 where it must be."""
     if value is not None and (not math.isfinite(value) or (positive and value <= 0)):
         raise ValueError(f"{option} must be a {'positive ' if positive else ''}finite number, got {value:g}")

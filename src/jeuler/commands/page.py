@@ -13,51 +13,51 @@ if TYPE_CHECKING:
     from jeuler.plotting.report import FitReport
 
 
-def page(measured: Measurement, found: Estimate, told: dict[str, Any]) -> FitReport:
-    """What is printed, with figures: data and fit, the residual, and how the errors go together."""
+def page(measured: Measurement, found: Estimate, result: dict[str, Any]) -> FitReport:
+    """What is printed, with figures: data and fit, the residual, and the correlation of the errors."""
     from jeuler.plotting.report import FitReport, Parameter
 
     count = len(measured.times)
-    spread = " and ".join(f"{name} = {value:.5g} {unit}" for name, value, _, unit in fitted_numbers(told)[:2])
+    spread = " and ".join(f"{name} = {value:.5g} {unit}" for name, value, _, unit in fitted_numbers(result)[:2])
     return FitReport(
-        title=f"Fit of {heading(told)}",
-        verdict=f"{spread}. The fit {told['message']} in {told['iterations']} iterations.",
+        title=f"Fit of {heading(result)}",
+        verdict=f"{spread}. The fit {result['message']} in {result['iterations']} iterations.",
         times=measured.times,
         observed=measured.positions.reshape(count, -1),
         predicted=found.predicted.reshape(count, -1),
         names=measured.names,
         parameters=[
             Parameter(name, value, _error(value, error), unit, "" if value else "at its bound 0")
-            for name, value, error, unit in fitted_numbers(told)
+            for name, value, error, unit in fitted_numbers(result)
         ],
         unit=measured.unit,
         quantity=measured.quantity,
-        facts=[*used(told), *derived(told), *_compared(told)],
-        warnings=told["warnings"],
-        next_steps=list(_next_steps(told)),
+        facts=[*used(result), *derived(result), *_compared(result)],
+        warnings=result["warnings"],
+        next_steps=list(_next_steps(result)),
         correlation=found.correlation,
         history=found.history,
     )
 
 
 def _error(value: float, error: float | None) -> float | None:
-    """The standard error; infinite where the data determine none, None at a bound."""
+    """The standard error; infinite where the data do not determine the value, None at the bound 0."""
     return error if error is not None else (float("inf") if value else None)
 
 
-def _compared(told: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = sorted(told.get("comparison", []), key=lambda row: row["score"])
+def _compared(result: dict[str, Any]) -> list[tuple[str, str]]:
+    rows = sorted(result.get("comparison", []), key=lambda row: row["score"])
     return [
-        (f"friction {row['friction']}", f"residual RMS {row['rms']:.4g} {told['unit']}, score +{row['score']:.3g}")
+        (f"friction {row['friction']}", f"residual RMS {row['rms']:.4g} {result['unit']}, score +{row['score']:.3g}")
         for row in rows
     ]
 
 
-def _next_steps(told: dict[str, Any]) -> Iterator[str]:
-    if not told["converged"]:
+def _next_steps(result: dict[str, Any]) -> Iterator[str]:
+    if not result["converged"]:
         yield "The fit did not converge: raise --max-iterations or give --start before any number is used."
-    if told["warnings"]:
+    if result["warnings"]:
         yield "Each warning above says what to do; after that, fit again."
-    elif not told.get("comparison"):
+    elif not result.get("comparison"):
         yield "Try --friction compare: it tells whether the data ask for viscous, quadratic or dry friction."
-    yield "Record the motion once more and compare: the difference between two recordings is the error that counts."
+    yield "Record the motion once more and compare: the difference between two recordings shows the error that counts."

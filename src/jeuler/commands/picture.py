@@ -17,17 +17,17 @@ from jeuler.commands.selection import Measurement
 MOST_POINTS = 4000
 
 
-def draw(measured: Measurement, found: Estimate, picture: str, told: dict[str, Any]) -> None:
+def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str, Any]) -> None:
     """Data, model and residual."""
     import matplotlib.pyplot as plt
 
     from jeuler.plotting import plot_fit
 
-    spring = told["springs"][0]
+    spring = result["springs"][0]
     source = os.path.basename(measured.source)
     title = f"{source}: ks = {spring['ks']:.4g} N/m, kd = {spring['kd']:.3g} N s/m"
-    if len(told["springs"]) > 1:
-        title = f"{source}: {len(told['springs'])} springs fitted"
+    if len(result["springs"]) > 1:
+        title = f"{source}: {len(result['springs'])} springs fitted"
     thin = max(1, len(measured.times) // MOST_POINTS)
     count = len(measured.times[::thin])
     figure = plot_fit(
@@ -46,7 +46,7 @@ def draw(measured: Measurement, found: Estimate, picture: str, told: dict[str, A
 
 
 def plain_text(text: str) -> str:
-    """A name as it is, where the picture would take a $ for mathematics, and without control characters."""
+    """A name to be drawn as it is: each $ escaped, which would start mathematics, and no control characters."""
     return "".join(c for c in text if c.isprintable()).replace("$", r"\$")
 
 

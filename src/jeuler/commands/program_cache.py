@@ -12,11 +12,11 @@ from pathlib import Path
 import jax
 import jaxlib
 
-MOST = 200 * 2**20  # bytes kept; what was not used for the longest goes first
+MOST = 200 * 2**20  # bytes kept; the least recently used go first
 
 
 def keep_programs() -> Path | None:
-    """Let JAX keep what it compiles in `folder`, and read it there; where to, or None where it does not.
+    """Let JAX store compiled programs below `folder` and read them there; returns the place, or None if it does not.
 
     It does not where JAX has a folder already (``JAX_COMPILATION_CACHE_DIR``), where its cache is switched off
     (``JAX_ENABLE_COMPILATION_CACHE=0``), or where nothing can be written.
@@ -39,7 +39,7 @@ def keep_programs() -> Path | None:
 
 
 def folder() -> Path:
-    """Where programs are kept: jeuler in the cache folder of the user, as the system has it."""
+    """Where programs are kept: ``jeuler`` in the user's cache folder of this operating system."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
     else:
@@ -48,7 +48,7 @@ def folder() -> Path:
 
 
 def of_this_machine() -> str:
-    """A name for these versions and this processor: programs are machine code, and a home may serve several."""
+    """A name for these versions and this processor: programs are machine code, and machines may share a home."""
     about = [jax.__version__, jaxlib.__version__, platform.machine(), platform.processor()]
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -59,7 +59,7 @@ def of_this_machine() -> str:
 
 
 def shorten(place: Path, most: int) -> None:
-    """Remove the files of a folder that were not used for the longest, until the others are at most so many bytes."""
+    """Remove the least recently used files of a folder until the others are at most so many bytes."""
     files = []
     for file in place.rglob("*"):
         try:

@@ -131,20 +131,20 @@ def equation(measured: Measurement, found: Estimate) -> str:
     return " ".join(parts).replace("- -", "+ ")
 
 
-Fact = tuple[str, str]  # what, and in words what it is
+Fact = tuple[str, str]  # its name, and its value in words
 
 
-def lines(told: dict[str, Any], picture: str | None, example: bool) -> list[str]:
+def lines(result: dict[str, Any], picture: str | None, example: bool) -> list[str]:
     """The result as lines of text."""
     numbers = []
-    for name, value, error, unit in fitted_numbers(told):
+    for name, value, error, unit in fitted_numbers(result):
         note = f"   (true {EXAMPLE[name]:g})" if example and name in ("ks", "kd") else ""
         numbers.append(_line(name, value, error, unit, note))
-    after = [*derived(told), ("time", f"{told['seconds']:.1f} s in all")]
+    after = [*derived(result), ("time", f"{result['seconds']:.1f} s in all")]
     if picture is not None:
         after.append(("picture", picture))
-    after += [("WARNING", warning) for warning in told["warnings"]]
-    return [heading(told), *map(_fact_line, used(told)), *numbers, *map(_fact_line, after)]
+    after += [("WARNING", warning) for warning in result["warnings"]]
+    return [heading(result), *map(_fact_line, used(result)), *numbers, *map(_fact_line, after)]
 
 
 def _fact_line(fact: Fact) -> str:
@@ -152,22 +152,22 @@ def _fact_line(fact: Fact) -> str:
     return f"  {name:<24} {words}"
 
 
-def used(told: dict[str, Any]) -> list[Fact]:
-    """What of the recording was used, and what was left out."""
-    facts = [("used", _used(told))]
-    if told["left_out"]:
-        out = [f"{entry['column']} ({entry['reason']})" for entry in told["left_out"]]
+def used(result: dict[str, Any]) -> list[Fact]:
+    """Which part of the recording was used, and what was left out."""
+    facts = [("used", _used(result))]
+    if result["left_out"]:
+        out = [f"{entry['column']} ({entry['reason']})" for entry in result["left_out"]]
         facts.append(("left out", listed(out)))
-    return facts + [("note", note) for note in told["notes"]]
+    return facts + [("note", note) for note in result["notes"]]
 
 
-def fitted_numbers(told: dict[str, Any]) -> list[tuple[str, float, float | None, str]]:
+def fitted_numbers(result: dict[str, Any]) -> list[tuple[str, float, float | None, str]]:
     """Name, value, standard error and unit of each number of the model."""
-    units, numbers = _units(told), []
-    for spring in told["springs"]:
-        where = "" if len(told["springs"]) == 1 else f" of {spring['edge']}"
+    units, numbers = _units(result), []
+    for spring in result["springs"]:
+        where = "" if len(result["springs"]) == 1 else f" of {spring['edge']}"
         for name in ("ks", "kd"):
-            if name == "kd" and "viscous" not in told["friction"]:
+            if name == "kd" and "viscous" not in result["friction"]:
                 continue
             numbers.append((name + where, spring[name], spring[name + "_stderr"], units[name]))
     for key, name in (
@@ -177,50 +177,52 @@ def fitted_numbers(told: dict[str, Any]) -> list[tuple[str, float, float | None,
         ("cubic", "cubic stiffness"),
         ("gain", "gain of the input"),
     ):
-        if key in told:
-            numbers.append((name, told[key], told[key + "_stderr"], units[key]))
+        if key in result:
+            numbers.append((name, result[key], result[key + "_stderr"], units[key]))
     return numbers
 
 
-def derived(told: dict[str, Any]) -> list[Fact]:
-    """What follows from the numbers, and how far they are to be trusted."""
+def derived(result: dict[str, Any]) -> list[Fact]:
+    """What follows from the parameters, and how far they can be trusted."""
     facts = []
-    if "pendulum_length" in told:
-        facts.append(("length", f"{told['pendulum_length']:.4g} m, of a point mass at g = {G} m/s^2"))
-    for mode in told["modes"]:
+    if "pendulum_length" in result:
+        facts.append(("length", f"{result['pendulum_length']:.4g} m, of a point mass at g = {G} m/s^2"))
+    for mode in result["modes"]:
         omega = mode["natural_frequency"]
         hertz = omega / (2 * np.pi)
         facts.append(("natural frequency", f"{omega:.5g} rad/s = {hertz:.4g} Hz (squared {omega**2:.4g} 1/s^2)"))
         facts.append(("damping ratio", f"{mode['damping_ratio'] + 0.0:.4g}"))
-    if told["equation"]:
-        facts.append(("equation", told["equation"]))
-    unit = told["unit"]
-    share = f"{100 * told['share_of_amplitude']:.2g} % of the amplitude {told['amplitude']:.3g} {unit}"
-    facts.append(("residual RMS", f"{told['rms']:.3g} {unit}, {share}"))
-    if told["stderr_widened_by"] > 1.05:
-        facts.append(("errors", f"widened {told['stderr_widened_by']:.2g} times, as the residual is correlated"))
-    facts.append(("trust", _trust(told)))
-    facts.append(("fit", f"{told['message']}, {told['iterations']} iterations"))
+    if result["equation"]:
+        facts.append(("equation", result["equation"]))
+    unit = result["unit"]
+    share = f"{100 * result['share_of_amplitude']:.2g} % of the amplitude {result['amplitude']:.3g} {unit}"
+    facts.append(("residual RMS", f"{result['rms']:.3g} {unit}, {share}"))
+    if result["stderr_widened_by"] > 1.05:
+        facts.append(("errors", f"widened {result['stderr_widened_by']:.2g} times, as the residual is correlated"))
+    facts.append(("trust", _trust(result)))
+    facts.append(("fit", f"{result['message']}, {result['iterations']} iterations"))
     return facts
 
 
-def heading(told: dict[str, Any]) -> str:
-    masses = ", ".join(f"{m:.4g}" for m in told["mass"])
-    run = f", run {told['run']}" if told["run"] else ""
-    inertia = "inertia" if told["quantity"].startswith("ang") else "mass"
+def heading(result: dict[str, Any]) -> str:
+    masses = ", ".join(f"{m:.4g}" for m in result["mass"])
+    run = f", run {result['run']}" if result["run"] else ""
+    inertia = "inertia" if result["quantity"].startswith("ang") else "mass"
     unit = "kg m^2" if inertia == "inertia" else "kg"
-    return f"{told['source']}{run}: {told['samples']} samples, {inertia} {masses} {unit}"
+    return f"{result['source']}{run}: {result['samples']} samples, {inertia} {masses} {unit}"
 
 
-def _used(told: dict[str, Any]) -> str:
-    rate = f", {told['rate']:.4g} samples a second" if told["rate"] else ""
-    names = listed(list(dict.fromkeys(told["columns"])))
-    begin, end = told["span"]
-    return f"{told['quantity']} {names} in {told['unit']} over {told['time']} from {begin:.5g} to {end:.5g} s{rate}"
+def _used(result: dict[str, Any]) -> str:
+    rate = f", {result['rate']:.4g} samples a second" if result["rate"] else ""
+    names = listed(list(dict.fromkeys(result["columns"])))
+    begin, end = result["span"]
+    return (
+        f"{result['quantity']} {names} in {result['unit']} over {result['time']} from {begin:.5g} to {end:.5g} s{rate}"
+    )
 
 
-def _units(told: dict[str, Any]) -> dict[str, str]:
-    if told["quantity"] in ("angle", "angular velocity"):
+def _units(result: dict[str, Any]) -> dict[str, str]:
+    if result["quantity"] in ("angle", "angular velocity"):
         return {
             "ks": "N m/rad",
             "kd": "N m s/rad",
@@ -246,13 +248,13 @@ def _line(name: str, value: float, error: float | None, unit: str, note: str = "
     return f"  {name:<24} {value:.5g}{spread} {unit}{note}"
 
 
-def _trust(told: dict[str, Any]) -> str:
-    """How far each number is to be trusted, in one line."""
+def _trust(result: dict[str, Any]) -> str:
+    """How well each of ks and kd is known, in one line."""
     words = []
-    for spring in told["springs"]:
-        where = "" if len(told["springs"]) == 1 else f" of {spring['edge']}"
+    for spring in result["springs"]:
+        where = "" if len(result["springs"]) == 1 else f" of {spring['edge']}"
         for name in ("ks", "kd"):
-            if name == "kd" and "viscous" not in told["friction"]:
+            if name == "kd" and "viscous" not in result["friction"]:
                 continue
             value, error = spring[name], spring[name + "_stderr"]
             if value == 0:
@@ -261,9 +263,9 @@ def _trust(told: dict[str, Any]) -> str:
                 words.append(f"{name}{where} not determined")
             else:
                 words.append(f"{name}{where} to {_percent(200 * error / abs(value))}")
-    ending = " (95 %), if the model is right" + ("; see the warnings" if told["warnings"] else "")
+    ending = " (95 %), if the model is right" + ("; see the warnings" if result["warnings"] else "")
     return ", ".join(words) + ending
 
 
 def _percent(share: float) -> str:
-    return "no better than its size" if share >= 100 else f"{max(share, 0.001):.2g} %"
+    return "100 % or more" if share >= 100 else f"{max(share, 0.001):.2g} %"

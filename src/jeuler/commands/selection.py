@@ -1,4 +1,4 @@
-"""What is fitted: the run, the columns and the span of a recording, as the options or the file's names say."""
+"""What is fitted: the run, the columns and the span of a recording, by the options or else by names and units."""
 
 from __future__ import annotations
 
@@ -21,7 +21,13 @@ from jeuler.fitting.trajectory import chosen_run
 LEAST_ROWS = 5
 THIN_ABOVE = 20_000  # rows
 SAMPLES_A_PERIOD = 40
-OBSERVED = ("position", "angle", "acceleration", "velocity", "angular velocity")  # the first that is there is taken
+OBSERVED = (
+    "position",
+    "angle",
+    "acceleration",
+    "velocity",
+    "angular velocity",
+)  # the first of these that the file has is taken
 UNITS = {"position": "m", "angle": "rad", "acceleration": "m/s^2", "velocity": "m/s", "angular velocity": "rad/s"}
 
 
@@ -30,7 +36,7 @@ class Measurement:
     """What is fitted.
 
     Attributes:
-      source: the file.  run: its label, "" where the file has one.  clock: the name of the time column.
+      source: the file.  run: its label, "" where the file has only one.  clock: the name of the time column.
       times: (time,), s.  positions: values of the observed quantity, (time, particle, dim), in `unit`.
       names: (particle * dim,).  quantity, unit: of the values.  left_out: (name, reason) of the other columns.
       notes: what was done, as sentences.  warnings: what may be wrong, as sentences with what to do.
@@ -55,13 +61,13 @@ class Measurement:
 
 
 def recordings_in(source: Any, arguments: Any) -> list[Recording]:
-    """The runs in a file, as understood with what the options correct."""
+    """The runs in a file, understood with the corrections that the options make."""
     table = read_table(source, arguments.skip or 0)
     return understand(table, arguments.time, _units(arguments.unit, table.names))
 
 
 def _units(text: str | None, names: list[str]) -> dict[str, str]:
-    """x=mm,t=ms as units by column name."""
+    """``x=mm,t=ms`` as units by column name."""
     units = {}
     for part in text.split(",") if text else []:
         name, equals, unit = part.rpartition("=")
@@ -78,7 +84,7 @@ def _units(text: str | None, names: list[str]) -> dict[str, str]:
 
 
 def resolve(name: str, available: list[str]) -> str | None:
-    """The column that is meant: by its name, or else, where only one is so, by its beginning or in another case."""
+    """The column that is meant: by its name, or else, where only one fits, in another case or by its first word."""
     if name in available:
         return name
     alike = [a for a in available if a.lower() == name.lower()] or [
@@ -119,7 +125,7 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
     if unknown:
         warnings.append(
             f"The unit of {listed(unknown)} has no known scale: positions are in {columns[0].unit}; "
-            f"ks and kd are right, as they do not depend on it, forces and amplitudes are not in SI units."
+            f"ks and kd are right, as they do not depend on it, but forces and amplitudes are not in SI units."
         )
     untold = [column.name for column in columns if not column.told]
     if untold:
@@ -154,7 +160,7 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
 
 
 def _size_words(columns: list[Column], quantity: str, values: np.ndarray) -> list[str]:
-    """A doubt where no unit is given and the numbers are larger than such a motion is as a rule."""
+    """A warning where no unit is given and the numbers are larger than is usual for such a motion."""
     usual = {"position": 2.0, "angle": 4 * np.pi}.get(quantity, np.inf)
     extent = float(np.nanmax(np.nanmax(values, axis=0) - np.nanmin(values, axis=0)))
     if any(column.unit for column in columns) or extent <= usual:
@@ -162,13 +168,14 @@ def _size_words(columns: list[Column], quantity: str, values: np.ndarray) -> lis
     others = "another unit or an acceleration" if quantity == "position" else "degrees"
     name = columns[0].name
     return [
-        f"{listed([c.name for c in columns])} has no unit and an extent of {extent:.3g}: taken in {UNITS[quantity]}. "
+        f"{listed([c.name for c in columns])} has no unit and an extent of {extent:.3g}: taken to be in "
+        f"{UNITS[quantity]}. "
         f"If it is {others}, give --unit, such as --unit {name}={'m/s^2' if quantity == 'position' else 'deg'}."
     ]
 
 
 def thinned(measured: Measurement) -> Measurement:
-    """Blocks of rows averaged to one, where there are far more than the motion needs."""
+    """The recording with blocks of rows averaged to one, where it has far more rows than the motion needs."""
     rows = len(measured.times)
     if rows <= THIN_ABOVE or measured.drive is not None:
         return measured
@@ -183,7 +190,8 @@ def thinned(measured: Measurement) -> Measurement:
     if block < 2:
         return measured
     times = block_means(measured.times, block)
-    note = f"Of {rows} rows every {block} are averaged to one: {rows / np.ptp(measured.times) * period:.0f} a period."
+    per_period = rows / np.ptp(measured.times) * period
+    note = f"Of {rows} rows every {block} are averaged to one: there were {per_period:.0f} a period."
     return dataclasses.replace(
         measured,
         times=times,
@@ -193,7 +201,7 @@ def thinned(measured: Measurement) -> Measurement:
 
 
 def together(measured: list[Measurement]) -> Measurement:
-    """Several recordings as one: a particle each, every clock from its first row, one quantity."""
+    """Several recordings as one, each a particle, with every clock starting at its first row."""
     first = measured[0]
     for other in measured[1:]:
         if (other.quantity, other.positions.shape[1:]) != (first.quantity, first.positions.shape[1:]):
@@ -229,20 +237,22 @@ def input_column(recording: Recording, arguments: Any) -> Column:
     name = resolve(arguments.input, [c.name for c in recording.columns])
     if name is None:
         names = listed([c.name for c in recording.columns])
-        raise ValueError(f"{recording.source}: --input {arguments.input!r} is no column, the columns are {names}")
+        raise ValueError(f"{recording.source}: --input {arguments.input!r} is no column; the columns are {names}")
     return next(c for c in recording.columns if c.name == name)
 
 
 def _check_drive(source: str, name: str, times: np.ndarray, drive: np.ndarray) -> None:
     if not np.isfinite(drive).all():
-        raise ValueError(f"{source}: --input {name}: {np.isnan(drive).sum()} values are missing; a force must be whole")
+        raise ValueError(
+            f"{source}: --input {name}: {np.isnan(drive).sum()} values are missing; the force must have none missing"
+        )
     clock = sampling(times)
     if clock.gaps or clock.repeated or clock.jitter > 0.02:
         raise ValueError(f"{source}: --input {name}: its clock must be even to be interpolated: {clock.words()}")
 
 
 def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], str, int, list[tuple[str, str]]]:
-    """The columns that are fitted, what they are, coordinates a particle, and the columns left out with the reason."""
+    """The columns to fit, their quantity, the coordinates per particle, and the columns left out with the reasons."""
     drive = None if arguments.input is None else input_column(recording, arguments)
     usable = [c for c in recording.columns if c.quantity != "text" and c != drive]
     if arguments.columns is not None:
@@ -290,7 +300,7 @@ def _reason(column: Column, quantity: str, usable: bool) -> str:
     if not usable:
         return "no values"
     kinds = {
-        "": "not known what it is",
+        "": "unknown quantity",
         "index": "an index of the rows",
         "absolute": "an absolute value, which has lost the sign",
         "uncertainty": "an uncertainty",
@@ -299,7 +309,7 @@ def _reason(column: Column, quantity: str, usable: bool) -> str:
 
 
 def _named_columns(recording: Recording, text: str) -> list[Column]:
-    """The columns of a list of names; a name may hold commas and quotes."""
+    """The columns of a list of names; a name may contain commas and quotes."""
     available = [c.name for c in recording.columns if c.quantity != "text"]
     names = _split_names(text, available)
     unknown = [name for name in names if name not in available]
@@ -336,16 +346,20 @@ def _split_names(text: str, available: list[str]) -> list[str]:
 
 
 def _one_channel(recording: Recording, columns: list[Column]) -> tuple[list[Column], list[tuple[str, str]]]:
-    """Of several channels that no axis or number tells apart, the one that swings most clearly."""
+    """Of several channels that no axis or number tells apart, the one that oscillates most clearly."""
     if len(columns) < 2 or any(c.axis or _number_of(c) for c in columns) or not all(c.told for c in columns):
         return columns, []
     clearest = max(columns, key=lambda c: _clearness(recording, c))
-    others = [(c.name, "another channel, which swings less clearly: --columns") for c in columns if c is not clearest]
+    others = [
+        (c.name, "another channel, whose oscillation is less clear; choose it with --columns")
+        for c in columns
+        if c is not clearest
+    ]
     return [clearest], others
 
 
 def _clearness(recording: Recording, column: Column) -> float:
-    """The share of the variance in the strongest line."""
+    """The squared amplitude of the strongest spectral line over the variance."""
     x = recording.values[:, recording.columns.index(column)]
     lines = strong_lines(recording.times, x, most=1)
     return lines[0][1] ** 2 / np.nanvar(x) if lines else 0.0
@@ -357,15 +371,15 @@ def _number_of(column: Column) -> str:
 
 
 def _particles(source: str, columns: list[Column], arguments: Any) -> tuple[list[Column], int]:
-    """The columns particle by particle, and how many coordinates each has."""
+    """The columns particle by particle, and the coordinates per particle."""
     axes = [c.axis for c in columns]
     if all(axes):
-        told = len(set(axes))
+        guessed = len(set(axes))
     elif any(_number_of(c) for c in columns) and all(c.told for c in columns):
-        told = 1
+        guessed = 1
     else:
-        told = len(columns) if len(columns) <= 3 else 1
-    dim = told if arguments.dim is None else arguments.dim
+        guessed = len(columns) if len(columns) <= 3 else 1
+    dim = guessed if arguments.dim is None else arguments.dim
     if dim < 1 or len(columns) % dim:
         raise ValueError(
             f"{source}: {len(columns)} columns ({listed([c.name for c in columns])}) do not make particles of "

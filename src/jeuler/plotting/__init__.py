@@ -1,4 +1,4 @@
-"""Figures and animations; the only package that imports matplotlib."""
+"""Figures and animations; imports matplotlib, so it is itself imported only where something is drawn."""
 
 from jeuler.plotting.accuracy import plot_work_precision
 from jeuler.plotting.camera import Camera

@@ -72,7 +72,7 @@ def plot_residual(times: Any, residual: Any, *, names: tuple[str, ...] | None = 
 
 
 def evenly(times: np.ndarray, values: np.ndarray) -> tuple[float, np.ndarray]:
-    """Step and values on as many even times."""
+    """The step of as many evenly spaced times, and the values interpolated to them."""
     even = np.linspace(times[0], times[-1], len(times))
     return float(even[1] - even[0]), np.interp(even, times, values)
 

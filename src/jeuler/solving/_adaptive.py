@@ -75,7 +75,8 @@ def solve_adaptive(
         dt <- dt min(5, max(0.2, 0.9 (e / c)^(-1/k))),   k the order of the step
 
     c is 0.1 for the method of Tsitouras, as errors of the steps add up, and 1 for the others; a tenth of that for the
-    step after a rejected one: f may jump there. Every step sees f at its end too, so that no jump is passed over.
+    step after a rejected one: f may jump there. The new dt is for the c of the next step. Every step sees f at its end
+    too, so that no jump is passed over.
 
     A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
     block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
@@ -92,7 +93,7 @@ def solve_adaptive(
       rtol: error allowed in a step, relative to the state.
       atol: error allowed in a step, in units of the state.
       dt0: first step to try, s; None guesses from the size of y0 and its slope.
-      max_steps: most steps between two of the times.
+      max_steps: most steps, rejected ones included, from one of the times or breaks to the next.
       breaks: times at which f may jump, (break,), s: a step ends there, f is evaluated just before the end of it and
         just after the start of the next. Differentiable.
     Returns: `AdaptiveSolution`.

@@ -147,7 +147,7 @@ class _Steps:
 
 
 def quantum(largest: Array) -> Array:
-    """The power of two of which numbers up to 2^HEADROOM times the largest are exact multiples."""
+    """The least power of two whose multiples are exact up to 2^HEADROOM times the largest."""
     _, exponent = jnp.frexp(largest)
     return jnp.ldexp(jnp.ones_like(largest), exponent + HEADROOM - jnp.finfo(largest.dtype).nmant - 1)
 

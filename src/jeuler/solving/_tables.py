@@ -40,7 +40,7 @@ def saved(t: Any) -> str:
 
 
 def nonfinite_in_words(first_nonfinite: Any) -> str:
-    """Every step, or the first that is not, of one run or of a batch."""
+    """Which steps are finite: every one, or the first that is not, of one run or of a batch."""
     steps = np.asarray(first_nonfinite)
     lost = steps[steps >= 0]
     if not lost.size:

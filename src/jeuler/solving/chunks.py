@@ -1,4 +1,4 @@
-"""A long run from a loop on the host, some steps at a time: it hears Ctrl-C, and tells how far it is.
+"""A long run from a loop on the host, some steps at a time, so that Ctrl-C stops it and progress can be shown.
 
 One program does any number of steps, so that nothing compiles again from chunk to chunk. It writes the saved states
 into the arrays of the `Solution`, whose memory goes from call to call.

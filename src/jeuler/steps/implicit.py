@@ -84,7 +84,7 @@ class ImplicitEuler:
       dt: step size, scalar, s. Every dt is stable where the equation itself is.
       args: passed to f; any pytree.
     Returns: the state at t + dt, NaN if it did not converge. Its cumulative error is O(dt).
-    Raises: ValueError, at trace time, if y is not floating. See `implicit_euler` for its tolerances.
+    Raises: ValueError, at trace time, if y is neither floating nor complex. See `implicit_euler` for its tolerances.
     Example:
       >>> import jeuler
       >>> round(float(jeuler.implicit_euler_step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None)), 6)
@@ -174,7 +174,7 @@ class LinearlyImplicitEuler:
       dt: step size, scalar, s.
       args: passed to f; any pytree.
     Returns: the state at t + dt, NaN where the linear solve failed. Its cumulative error is O(dt).
-    Raises: ValueError, at trace time, if y is not floating.
+    Raises: ValueError, at trace time, if y is neither floating nor complex.
     Example:
       >>> import jeuler
       >>> round(float(jeuler.linearly_implicit_euler_step(lambda t, y, args: -y, 0.0, 1.0, 1.0, None)), 6)

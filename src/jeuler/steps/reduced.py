@@ -18,7 +18,7 @@ from jeuler._core import trees
 from jeuler.steps.explicit import Step
 
 MOST = 64  # dimension of the Krylov space
-MOST_WHOLE = 192  # where all that is asked of it is its eigenvalues, up to
+MOST_WHOLE = 192  # the same for a state without halves, of at most MANY numbers
 MANY = 20_000  # numbers in the state
 LEAST = 6  # runs, however slow the machine
 SEGMENTS = 4  # of a run, compared with each other
@@ -36,7 +36,7 @@ def arnoldi(product: Callable[[np.ndarray], np.ndarray], start: np.ndarray, most
         basis[:, k] = vector / size
         vector = product(basis[:, k])
         before = np.linalg.norm(vector)
-        for _ in range(2):  # twice is enough
+        for _ in range(2):  # twice: once would leave roundoff that is not orthogonal
             vector = vector - basis[:, : k + 1] @ (basis[:, : k + 1].T @ vector)
         size = np.linalg.norm(vector)
         if size <= 1e-12 * before:  # the space is closed

@@ -90,7 +90,7 @@ class StepMap:
 
         small = len(self.image(1 / self.scale)) <= SMALL
 
-        def next_to(dt):  # few tries where each is dear: limits are mostly at dt |lambda| from 0.1 to 3
+        def next_to(dt):  # few tries where each is expensive: limits are mostly at dt |lambda| from 0.1 to 3
             return dt * 10 ** (1 / 16 if small else 1 / 8 if 0.05 < dt * self.scale < 8 else 1 / 2)
 
         dt = 1e-3 / self.scale

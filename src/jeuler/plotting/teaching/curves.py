@@ -52,7 +52,7 @@ def slope_field(
       num: lines along each side.
       ax: matplotlib axes; None makes a figure.
     Returns: the axes.
-    Raises: ValueError, if dt is not positive or num not a number of lines.
+    Raises: ValueError, if dt is not positive or num is below 2.
     Example:
       >>> from jeuler.plotting import slope_field
       >>> ax = slope_field(lambda x, y, args: -y, (0.0, 2.0), (0.0, 1.0), solutions={"y(0) = 1": 1.0})
@@ -124,7 +124,7 @@ def euler_polygon(
       >>> ax.lines[1].get_ydata().tolist()
       [1.0, 0.5, 0.25]
 
-    Source: L. Euler, Institutiones calculi integralis I, 1768, sect. 650 (the method); E. Hairer, S. Norsett, G.
+    Source: L. Euler, Institutionum calculi integralis I, 1768, sect. 650 (the method); E. Hairer, S. Norsett, G.
       Wanner, Solving Ordinary Differential Equations I, 1993, sect. I.7 (Euler polygons).
     """
     dt = (t1 - t0) / checks.count("num_steps", num_steps, least=1)

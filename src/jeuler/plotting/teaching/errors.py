@@ -87,7 +87,7 @@ def error_against_dt(
 ) -> Any:
     """Error at t1 against dt until roundoff turns it up again; dashed, the same with compensated sums.
 
-        error = C dt^p + roundoff,  roundoff growing as the number of steps does
+        error = C dt^p + roundoff,  roundoff growing with the number of steps
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``.
