@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeuler._jax.anywhere import anywhere
+from jeuler._jax.anywhere import anywhere, where_needed
 from jeuler._jax.found import found
 
 
@@ -53,3 +53,14 @@ def test_anywhere_is_one_answer_for_a_batch():
     np.testing.assert_allclose(jax.vmap(f)(x), jnp.sin(x))
     np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(f)))(x[:2]), -jnp.sin(x[:2]))
     assert "select_n" not in str(jax.make_jaxpr(jax.vmap(f))(x))
+
+
+def test_work_is_done_for_the_members_that_need_it_alone():
+    def one(x):
+        return where_needed(x > 1, lambda x: (10 * x, jnp.sin(x)), (x, jnp.zeros_like(x)), x)
+
+    x = jnp.array([0.5, 2.0, 1.0])
+    for found in (jax.vmap(one)(x), jax.jit(jax.vmap(one))(x)):
+        np.testing.assert_allclose(found[0], [0.5, 20.0, 1.0])
+        np.testing.assert_allclose(found[1], [0.0, np.sin(2.0), 0.0])
+    np.testing.assert_allclose(jax.vmap(one)(jnp.zeros(2))[0], 0)

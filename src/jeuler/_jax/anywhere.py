@@ -6,9 +6,12 @@ one is the same for all, and so the branch is run only if one of the members nee
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.interpreters import ad, batching, mlir
 
 from jeuler._jax.jaxpr import Primitive
@@ -19,6 +22,15 @@ anywhere_p = Primitive("anywhere")
 def anywhere(what: Array) -> Array:
     """One boolean: whether ``what`` is true in any place and in any member of the batches around."""
     return anywhere_p.bind(what)
+
+
+def where_needed(needed: Array, work: Callable[..., Any], otherwise: Any, *operands: Any) -> Any:
+    """``work(*operands)`` where needed, (); ``otherwise``, of the same form, elsewhere.
+
+    In a batch the work is skipped if no member needs it, and no member gets what only another one needs.
+    """
+    result = lax.cond(anywhere(needed), work, lambda *_: otherwise, *operands)
+    return jax.tree.map(lambda done, not_done: jnp.where(needed, done, not_done), result, otherwise)
 
 
 anywhere_p.def_impl(jax.jit(jnp.any))

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from jeuler._core.vectors import length
-from jeuler._jax.anywhere import anywhere
+from jeuler._jax.anywhere import where_needed
 from jeuler._jax.found import found, found_p
 from jeuler.contact.contacts import Contacts, Look
 from jeuler.contact.impacts import go_through, impulsive_limit, schedule
@@ -53,11 +53,10 @@ def _resolve(
     position = jnp.where(touched, moved, x_free)
     velocity = jnp.where(touched, v_end + jump, v_free)
     if len(contacts.colliders) > 1 or len(contacts.i):
-        kick, shift = lax.cond(
-            anywhere(left > 0), settle, no_change, *lax.stop_gradient((contacts, after, velocity, slow))
-        )
-        mine = left > 0  # under vmap it is worked out for all members if one has need of it
-        position, velocity = position + jnp.where(mine, shift, 0), velocity + jnp.where(mine, kick, 0)
+        unchanged = jnp.zeros_like(velocity), jnp.zeros_like(position)
+        operands = lax.stop_gradient((contacts, after, velocity, slow))
+        kick, shift = where_needed(left > 0, settle, unchanged, *operands)
+        position, velocity = position + shift, velocity + kick
     position = jnp.where(lost[:, None], jnp.nan, position)  # a surface that cannot say where it is: announced
     return position, velocity, unresolved + left + contacts.left_out
 
@@ -74,10 +73,6 @@ def settle(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tupl
     gap = end.gap / contacts.dt
     problem = Problem(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
     return together(problem, small)
-
-
-def no_change(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tuple[Array, Array]:
-    return jnp.zeros_like(velocity), jnp.zeros_like(velocity)
 
 
 def _slow(contacts: Contacts, dv: Array) -> Array:
