@@ -60,7 +60,7 @@ def test_work_is_done_for_the_members_that_need_it_alone():
         return where_needed(x > 1, lambda x: (10 * x, jnp.sin(x)), (x, jnp.zeros_like(x)), x)
 
     x = jnp.array([0.5, 2.0, 1.0])
-    for found in (jax.vmap(one)(x), jax.jit(jax.vmap(one))(x)):
-        np.testing.assert_allclose(found[0], [0.5, 20.0, 1.0])
-        np.testing.assert_allclose(found[1], [0.0, np.sin(2.0), 0.0])
+    for first, second in (jax.vmap(one)(x), jax.jit(jax.vmap(one))(x)):
+        np.testing.assert_allclose(first, [0.5, 20.0, 1.0])
+        np.testing.assert_allclose(second, [0.0, np.sin(2.0), 0.0])
     np.testing.assert_allclose(jax.vmap(one)(jnp.zeros(2))[0], 0)

@@ -9,6 +9,16 @@ import tempfile
 from collections.abc import Callable
 
 
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file in UTF-8 by `write_atomically`, its line ends as they are."""
+
+    def write(temporary: str) -> None:
+        with open(temporary, "w", newline="", encoding="utf-8") as file:
+            file.write(text)
+
+    write_atomically(path, write)
+
+
 def write_atomically(path: str | os.PathLike[str], write: Callable[[str], object]) -> None:
     """Let ``write(temporary_path)`` make a file, then move it to its place; a failure leaves what was there.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.component import result
 from jeuler._core.describe import table
+from jeuler._core.files import write_text
 from jeuler.accuracy.markdown import markdown
 
 NAN = math.nan
@@ -197,11 +199,12 @@ class WorkPrecision:
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
         """Write every row, every column; repeats separated by spaces. `from_csv` reads it back."""
-        with open(path, "w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(EMPTY_ROW))
-            writer.writeheader()
-            for row in self.rows:
-                writer.writerow({k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()})
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, list(EMPTY_ROW))
+        writer.writeheader()
+        for row in self.rows:
+            writer.writerow({k: " ".join(map(repr, v)) if isinstance(v, tuple) else v for k, v in row.items()})
+        write_text(path, text.getvalue())
 
     @classmethod
     def from_csv(cls, path: str | os.PathLike[str]) -> WorkPrecision:

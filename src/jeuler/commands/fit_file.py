@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jeuler._core.files import check_output, write_atomically
+from jeuler._core.files import check_output, write_text
 from jeuler.commands import options
 from jeuler.commands.cautions import cautions
 from jeuler.commands.estimate import Estimate, estimate, guess_of, step_size
@@ -21,7 +21,7 @@ from jeuler.commands.linear_start import band_limited
 from jeuler.commands.model import Model
 from jeuler.commands.page import page
 from jeuler.commands.picture import draw
-from jeuler.commands.report import lines, report
+from jeuler.commands.report import compared, lines, report
 from jeuler.commands.selection import Measurement, recordings_in, select, together
 from jeuler.fitting.oscillation import Oscillation
 
@@ -34,6 +34,7 @@ def fit_file(arguments: argparse.Namespace, started: float) -> None:
     """Read, fit, print, draw."""
     picture = DEFAULT_PICTURE if arguments.plot is None else arguments.plot
     _check_outputs(arguments.files, {"--plot": picture, "--json": arguments.json, "--report": arguments.report})
+    _check_kind(picture)
     for option in ("begin", "end"):
         options.check_number({"begin": "--from", "end": "--to"}[option], getattr(arguments, option))
     options.check_number("--dt", arguments.dt, positive=True)
@@ -156,7 +157,10 @@ def _check_outputs(files: list[str], asked: dict[str, str | None]) -> None:
         for other, earlier in plain[:k]:
             if os.path.realpath(path) == os.path.realpath(earlier):
                 raise ValueError(f"{other} and {option} must be different files, got {path} for both")
-    picture = asked["--plot"] or DEFAULT_PICTURE
+
+
+def _check_kind(picture: str) -> None:
+    """One ValueError if a picture has no ending that says its kind."""
     ending = os.path.splitext(os.path.realpath(picture))[1].lower()
     if picture != STANDARD_OUTPUT and not _is_stream(picture) and ending not in PICTURES:
         raise ValueError(
@@ -195,23 +199,9 @@ def _write_outputs(
         if arguments.json == STANDARD_OUTPUT:
             sys.stdout.write(text)
         else:
-            write_atomically(arguments.json, lambda path: _write_text(path, text))
+            write_text(arguments.json, text)
     piped = STANDARD_OUTPUT in (picture, arguments.json, arguments.report)
     where = None if picture == STANDARD_OUTPUT else picture
     printed = lines(result, where, example=not arguments.files)
-    print("\n".join(printed + _compared(result)), file=sys.stderr if piped else sys.stdout)
-
-
-def _compared(result: dict[str, Any]) -> list[str]:
-    rows = sorted(result.get("comparison", []), key=lambda row: row["score"])
-    return [
-        f"  {'friction ' + row['friction']:<28} residual RMS {row['rms']:.4g} {result['unit']}, "
-        + ("the best" if k == 0 else f"worse by {row['score']:.3g}")
-        + (" (over 10: clearly)" if row["score"] > 10 else "")
-        for k, row in enumerate(rows)
-    ]
-
-
-def _write_text(path: str, text: str) -> None:
-    with open(path, "w", encoding="utf-8") as file:
-        file.write(text)
+    frictions = [f"  {name:<28} {words}" for name, words in compared(result)]
+    print("\n".join(printed + frictions), file=sys.stderr if piped else sys.stdout)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from jeuler.commands.estimate import Estimate
-from jeuler.commands.report import derived, fitted_numbers, heading, used
+from jeuler.commands.report import compared, derived, fitted_numbers, heading, used
 from jeuler.commands.selection import Measurement
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def page(measured: Measurement, found: Estimate, result: dict[str, Any]) -> FitR
         ],
         unit=measured.unit,
         quantity=measured.quantity,
-        facts=[*used(result), *derived(result), *_compared(result)],
+        facts=[*used(result), *derived(result), *compared(result)],
         warnings=result["warnings"],
         next_steps=list(_next_steps(result)),
         correlation=found.correlation,
@@ -43,14 +43,6 @@ def page(measured: Measurement, found: Estimate, result: dict[str, Any]) -> FitR
 def _error(value: float, error: float | None) -> float | None:
     """The standard error; infinite where the data do not determine the value, None at the bound 0."""
     return error if error is not None else (float("inf") if value else None)
-
-
-def _compared(result: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = sorted(result.get("comparison", []), key=lambda row: row["score"])
-    return [
-        (f"friction {row['friction']}", f"residual RMS {row['rms']:.4g} {result['unit']}, score +{row['score']:.3g}")
-        for row in rows
-    ]
 
 
 def _next_steps(result: dict[str, Any]) -> Iterator[str]:

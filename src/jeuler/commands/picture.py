@@ -21,7 +21,7 @@ def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str,
     """Data, model and residual."""
     import matplotlib.pyplot as plt
 
-    from jeuler.plotting import plot_fit
+    from jeuler.plotting.fits import plain_text, plot_fit
 
     spring = result["springs"][0]
     source = os.path.basename(measured.source)
@@ -43,11 +43,6 @@ def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str,
     kind = os.path.splitext(os.path.realpath(picture))[1][1:].lower() or "png"
     write_atomically(picture, lambda path: figure.savefig(path, dpi=130, format=kind))
     plt.close(figure)
-
-
-def plain_text(text: str) -> str:
-    """A name to be drawn as it is: each $ escaped, which would start mathematics, and no control characters."""
-    return "".join(c for c in text if c.isprintable()).replace("$", r"\$")
 
 
 def _curve(measured: Measurement, found: Estimate) -> tuple[np.ndarray, np.ndarray]:

@@ -204,6 +204,20 @@ def derived(result: dict[str, Any]) -> list[Fact]:
     return facts
 
 
+def compared(result: dict[str, Any]) -> list[Fact]:
+    """The friction laws that were compared, the best first."""
+    rows = sorted(result.get("comparison", []), key=lambda row: row["score"])
+    return [
+        (
+            f"friction {row['friction']}",
+            f"residual RMS {row['rms']:.4g} {result['unit']}, "
+            + ("the best" if k == 0 else f"worse by {row['score']:.3g}")
+            + (" (over 10: clearly)" if row["score"] > 10 else ""),
+        )
+        for k, row in enumerate(rows)
+    ]
+
+
 def heading(result: dict[str, Any]) -> str:
     masses = ", ".join(f"{m:.4g}" for m in result["mass"])
     run = f", run {result['run']}" if result["run"] else ""

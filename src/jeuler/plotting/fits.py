@@ -79,3 +79,8 @@ def plot_fit(
     for axis in (above, below):
         axis.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def plain_text(text: str) -> str:
+    """A name to be drawn as it is: each $ escaped, which would start mathematics, and no control characters."""
+    return "".join(c for c in text if c.isprintable()).replace("$", r"\$")

@@ -15,8 +15,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from jeuler._core.files import write_atomically
-from jeuler.plotting.fits import plot_fit
+from jeuler._core.files import write_text
+from jeuler.plotting.fits import plain_text, plot_fit
 from jeuler.plotting.residuals import plot_correlation, plot_history, plot_net, plot_residual
 
 MOST_POINTS = 1500  # of a column in a figure: what is denser is thinned
@@ -108,13 +108,7 @@ class FitReport:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """The page, written whole or not at all."""
-        text = self.html()
-
-        def write(temporary: str) -> None:
-            with open(temporary, "w", encoding="utf-8") as file:
-                file.write(text)
-
-        write_atomically(path, write)
+        write_text(path, self.html())
 
     def html(self) -> str:
         """The page as text."""
@@ -181,7 +175,7 @@ class FitReport:
         note = [f'<p class="note">The {len(shown)} columns of {len(seen)} with the largest residuals.</p>']
         note = note if len(shown) < len(seen) else []
         thin = slice(None, None, max(1, -(-len(residual) // MOST_POINTS)))
-        names = tuple(_plain(self.names[k]) for k in shown)
+        names = tuple(plain_text(self.names[k]) for k in shown)
         times = np.asarray(self.times, float)
         curves = plot_fit(times[thin], observed[thin][:, shown], predicted[thin][:, shown], names=names, unit=self.unit)
         curves.axes[0].set_ylabel(f"{self.quantity} [{self.unit}]")
@@ -194,11 +188,6 @@ class FitReport:
 
 def _right(number: bool) -> str:
     return ' class="number"' if number else ""
-
-
-def _plain(text: str) -> str:
-    """A name as it is, where a figure would take a $ for mathematics."""
-    return text.replace("$", r"\$")
 
 
 def _figure(figure: Figure, words: str) -> str:
