@@ -11,13 +11,11 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler._core.partition import arrays_only
 from jeuler._core.precision import flat
+from jeuler.accuracy.asked import Asked
 from jeuler.accuracy.pilot import Ladder
 from jeuler.accuracy.roundoff import COUNTER
 from jeuler.accuracy.search import AIM, FACTOR, Search
-from jeuler.particles.scene import Scene, effects_left_out
-from jeuler.solving._breaks import checked_breaks
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
 PyTree = Any
@@ -123,40 +121,28 @@ def advise_step(
     Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P. Henrici, Discrete
       Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
-    left_out = ""
-    if isinstance(f, Scene):
-        effects = effects_left_out(f)
-        left_out = f"; without {', '.join(effects)}, which pilot runs leave out" if effects else ""
-        (y0, args), f = f.as_equation(y0), f.without_effects().vector_field
-    y0 = checks.state("y0", y0)
-    checks.untraced("advise_step", y0, args, t0, t1, error)
-    t0, t1 = checks.interval(t0, t1)
-    checks.positive("error", error)
-    checks.field_form(f)
-    f, args = arrays_only(f, args)
-    checks.vector_field(f, t0, y0, args)
+    asked = Asked.of("advise_step", f, y0, t0=t0, t1=t1, args=args, error=error, relative=relative, breaks=breaks)
     checks.function("step", step, "(f, t, y, dt, args) -> y", "pass, say, jeuler.euler_step")
-    checks.true_or_false("relative", relative)
     checks.true_or_false("compensated", compensated)
     if max_pilot_steps is None:
         work = PILOT_WORK if is_explicit(step) else PILOT_WORK // IMPLICIT_WORK
-        max_pilot_steps = max(4096, work // max(1, flat(y0).size))
+        max_pilot_steps = max(4096, work // max(1, flat(asked.y0).size))
     max_pilot_steps = checks.count("max_pilot_steps", max_pilot_steps, least=64)
     search = Search(
-        f,
-        y0,
-        t0,
-        t1,
-        args,
+        asked.f,
+        asked.y0,
+        asked.t0,
+        asked.t1,
+        asked.args,
         step,
-        float(error),
+        asked.error,
         relative=relative,
         compensated=compensated,
         most=max_pilot_steps,
-        breaks=tuple(float(b) for b in np.asarray(checked_breaks(breaks, float)) if t0 <= float(b) <= t1),
+        breaks=asked.breaks,
     )
     advice = _Words(search).advice()
-    return dataclasses.replace(advice, reason=advice.reason + left_out)
+    return dataclasses.replace(advice, reason=advice.reason + asked.left_out)
 
 
 def is_explicit(step: Any) -> bool:

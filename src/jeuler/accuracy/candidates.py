@@ -9,14 +9,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from jeuler._core import trees
 from jeuler._core.precision import double_precision
 from jeuler.accuracy.method import has_diffrax, is_diffrax
 from jeuler.solving._adaptive import solve_adaptive
-from jeuler.solving._breaks import checked_breaks, split_at
-from jeuler.solving._scan import advance_by, solve
+from jeuler.solving._scan import solve, solve_to
 from jeuler.steps.explicit import (
     VectorField,
     euler_step,
@@ -162,19 +160,18 @@ def program(candidate: Candidate, problem: Problem) -> Any:
 
 def _fixed(candidate: Candidate, problem: Problem) -> Any:
     def run(y0, args, t0, t1, num_steps):
-        advance = advance_by(candidate.step, compensated=False)
-        if problem.breaks:
-            advance = split_at(advance, checked_breaks(problem.breaks, t0.dtype))
-        dt = (t1 - t0) / num_steps.astype(t0.dtype)
-
-        def one_step(n, carry):
-            first_nonfinite, state = carry
-            state = advance(problem.f, t0 + n.astype(dt.dtype) * dt, state, dt, args)
-            lost = (first_nonfinite < 0) & ~trees.all_finite(state[0])  # as `solve` looks for it
-            return jnp.where(lost, n, first_nonfinite), state
-
-        _, (y, _) = lax.fori_loop(0, num_steps, one_step, (jnp.int32(-1), (y0, None)))
-        return y, num_steps
+        states, _ = solve_to(
+            problem.f,
+            y0,
+            dt=(t1 - t0) / num_steps.astype(t0.dtype),
+            ends=num_steps[None],
+            t0=t0,
+            args=args,
+            step=candidate.step,
+            compensated=False,
+            breaks=problem.breaks,
+        )
+        return jax.tree.map(lambda leaf: leaf[-1], states), num_steps
 
     return run
 

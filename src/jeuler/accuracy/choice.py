@@ -14,8 +14,8 @@ from jeuler._core import checks, trees
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler._core.describe import table
-from jeuler._core.partition import arrays_only
 from jeuler._core.precision import flat
+from jeuler.accuracy.asked import Asked
 from jeuler.accuracy.candidates import (
     Candidate,
     Problem,
@@ -28,8 +28,6 @@ from jeuler.accuracy.method import has_diffrax
 from jeuler.accuracy.pilot import distance
 from jeuler.accuracy.trials import Found, Target, Trial, cheapest, milliseconds
 from jeuler.accuracy.written import code_of
-from jeuler.particles.scene import Scene, effects_left_out
-from jeuler.solving._breaks import checked_breaks
 from jeuler.steps.explicit import VectorField
 
 PyTree = Any
@@ -195,23 +193,17 @@ def advise_method(
       of methods by work against error).
     """
     begun = time.perf_counter()
-    given = _Given.of(f, y0, args)
-    f, y0, args = given.f, given.y0, given.args
-    y0 = checks.state("y0", y0)
-    checks.untraced("advise_method", y0, args, t0, t1, error)
-    t0, t1 = checks.interval(t0, t1)
-    checks.positive("error", error)
+    asked = Asked.of("advise_method", f, y0, t0=t0, t1=t1, args=args, error=error, relative=relative, breaks=breaks)
     checks.positive("patience", patience)
-    checks.field_form(f)
-    f, args = arrays_only(f, args)
-    checks.vector_field(f, t0, y0, args)
-    checks.true_or_false("relative", relative)
-    within = [float(b) for b in np.asarray(checked_breaks(breaks, float)) if t0 <= float(b) <= t1]
-    problem = Problem(f, y0, t0, t1, args, tuple(within))
-    candidates = default_candidates(f, y0, t0, args) if methods is None else given_candidates(_checked(methods))
+    problem = Problem(asked.f, asked.y0, asked.t0, asked.t1, asked.args, asked.breaks)
+    candidates = (
+        default_candidates(asked.f, asked.y0, asked.t0, asked.args)
+        if methods is None
+        else given_candidates(_checked(methods))
+    )
     absent = methods is None and not has_diffrax()
-    left_out = given.left_out + ("; diffrax is not installed, so without its solvers" if absent else "")
-    ranking = _Ranking(problem, float(error), relative, begun + float(patience), given.scene)
+    left_out = asked.left_out + ("; diffrax is not installed, so without its solvers" if absent else "")
+    ranking = _Ranking(problem, asked.error, relative, begun + float(patience), asked.scene)
     return ranking.advice(candidates, begun, left_out)
 
 
@@ -229,26 +221,6 @@ def _checked(methods: Any) -> Mapping[str, Any]:
             )
         checks.refuse_class(f"methods[{name!r}] must be a step or a diffrax solver", method)
     return methods
-
-
-@dataclasses.dataclass(frozen=True)
-class _Given:
-    """A field, or a scene and its state, as an equation."""
-
-    f: Any
-    y0: Any
-    args: Any
-    scene: bool
-    left_out: str
-
-    @classmethod
-    def of(cls, f: Any, y0: Any, args: Any) -> _Given:
-        if not isinstance(f, Scene):
-            return cls(f, y0, args, False, "")
-        effects = effects_left_out(f)
-        left_out = f"; without {', '.join(effects)}, which pilot runs leave out" if effects else ""
-        y0, args = f.as_equation(y0)
-        return cls(f.without_effects().vector_field, y0, args, True, left_out)
 
 
 class _Ranking:

@@ -15,9 +15,9 @@ import numpy as np
 
 from jeuler._core.precision import cast, flat, precision
 from jeuler.accuracy.candidates import Candidate, Problem, program, written_out
+from jeuler.accuracy.method import is_diffrax
 from jeuler.accuracy.pilot import distance
 from jeuler.accuracy.roundoff import COUNTER
-from jeuler.accuracy.runs import is_diffrax
 
 AIM = 0.95  # of the target, that the cheapest run is to meet
 NEAR = 0.75  # of the target: an error above it ends the search between two numbers of steps
