@@ -22,6 +22,11 @@ def precision(dtype: Any) -> AbstractContextManager:
     return enable_x64(double)
 
 
+def setting(name: str) -> Any:
+    """The value of a setting of JAX, such as "jax_enable_x64"; the type of ``jax.config`` does not name them."""
+    return getattr(jax.config, name)
+
+
 def double_precision() -> AbstractContextManager:
     """A context in which float64 exists; float32 arrays keep their dtype in it."""
     return precision(np.float64)

@@ -23,6 +23,7 @@ import numpy as np
 from jax._src import core  # which trace is at work: no public name says it without warnings
 
 from jeuler._core.component import Function, Partitioned
+from jeuler._core.precision import setting
 from jeuler._jax.captured import CYCLE, Opaque, WithArrays, token, trusted
 
 MOST = 128  # programs kept; the one not used for the longest goes first
@@ -69,7 +70,7 @@ def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
         anything. The function gets these wrapped as well.
       settings: hashable values that are part of the program.
     """
-    if jax.config.jax_disable_jit or _under_jit():  # type: ignore[attr-defined]
+    if setting("jax_disable_jit") or _under_jit():
         return function(*inputs, *settings)
     return prepared(function, inputs, settings)()
 

@@ -12,6 +12,8 @@ from pathlib import Path
 import jax
 import jaxlib
 
+from jeuler._core.precision import setting
+
 MOST = 200 * 2**20  # bytes kept; the least recently used go first
 
 
@@ -21,9 +23,8 @@ def keep_programs() -> Path | None:
     It does not where JAX has a folder already (``JAX_COMPILATION_CACHE_DIR``), where its cache is switched off
     (``JAX_ENABLE_COMPILATION_CACHE=0``), or where nothing can be written.
     """
-    # jax.config has these attributes, its type does not say so
-    has_one = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if has_one or not jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
+    has_one = setting("jax_compilation_cache_dir")
+    if has_one or not setting("jax_enable_compilation_cache"):
         return None
     place = folder() / of_this_machine()
     try:

@@ -79,11 +79,13 @@ class Forward:
     def residual_at(self, x: np.ndarray, data: dict[str, Any], parts: int = 1) -> Pair:
         """Prediction minus measurement, and a function that gives its Jacobian; ``parts`` steps for each step."""
 
+        nodes = self.nodes.kept(data, self.prediction.num_steps)
+        columns, observed = np.asarray(self.prediction.columns, int), data["observed"]
+
         def program(x, data, directions):
-            kept, changes = self.run(x, data, directions, parts)
-            columns, observed = np.asarray(self.prediction.columns, int), data["observed"]
-            seen = self.interpolated(kept, data, parts, columns)
-            seen_changes = self.interpolated(changes, data, parts, columns)
+            kept, changes = self.run(x, data, directions, nodes, parts)
+            seen = self.interpolated(kept, data, nodes, columns)
+            seen_changes = self.interpolated(changes, data, nodes, columns)
             if not observed.all():
                 seen_changes = np.where(observed, seen_changes, 0)
             return np.where(observed, seen - data["targets"], 0).ravel(), seen_changes.reshape(len(directions), -1)
@@ -92,18 +94,21 @@ class Forward:
 
     def positions(self, x: np.ndarray, data: dict[str, Any]) -> np.ndarray:
         """Positions of all particles at the times, (time, particle, dim), m."""
-        kept, _ = self.run(x, data, directions_of(0, len(x)), 1)
-        return self.interpolated(kept, data, 1, None).reshape(-1, *data["state"].position.shape)
+        nodes = self.nodes.kept(data, self.prediction.num_steps)
+        kept, _ = self.run(x, data, directions_of(0, len(x)), nodes, 1)
+        return self.interpolated(kept, data, nodes, None).reshape(-1, *data["state"].position.shape)
 
-    def run(self, x: np.ndarray, data: dict[str, Any], directions: np.ndarray, parts: int) -> tuple[Any, Any]:
+    def run(
+        self, x: np.ndarray, data: dict[str, Any], directions: np.ndarray, nodes: Any, parts: int
+    ) -> tuple[Any, Any]:
         """The motion by component at the rows that are kept, and its changes in each direction."""
         arrays, rest = partition({name: data[name] for name in ("scene", "state", "dt", "t0")}, is_array)
-        row, _ = self.nodes.kept(data, self.prediction.num_steps)
+        row, _ = nodes
         return _compiled(self, rest)(x, arrays, row, np.int32(self.prediction.num_steps * parts), directions)
 
-    def interpolated(self, kept: Any, data: dict[str, Any], parts: int, columns: np.ndarray | None) -> np.ndarray:
+    def interpolated(self, kept: Any, data: dict[str, Any], nodes: Any, columns: np.ndarray | None) -> np.ndarray:
         """Positions at the times, (..., time, column), of these columns of position.ravel()."""
-        _, rows = self.nodes.kept(data, self.prediction.num_steps)
+        _, rows = nodes
 
         def at(components: Any, which: int) -> np.ndarray:
             parts = [_chosen(np.asarray(x), rows[which], -2) for x in components]

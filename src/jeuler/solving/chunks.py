@@ -19,6 +19,7 @@ from jax import Array, lax
 
 from jeuler._core import checks
 from jeuler._core.component import replace
+from jeuler._core.precision import setting
 from jeuler._jax import programs
 from jeuler.solving.grid import COUNTER, Grid, check_counter
 from jeuler.solving.loop import Loop
@@ -48,7 +49,7 @@ def check_progress(progress: Any, checkpoint: Any) -> None:
 
 def can_be_in_chunks(checkpoint: Any) -> bool:
     """Whether a run with this checkpoint can be done in pieces: not a traced one, nor a reversible one."""
-    return not programs.is_transformed() and checkpoint != "reversible" and not jax.config.jax_disable_jit  # type: ignore
+    return not programs.is_transformed() and checkpoint != "reversible" and not setting("jax_disable_jit")
 
 
 def run_in_chunks(
@@ -58,7 +59,7 @@ def run_in_chunks(
 
     That is a short one, one that is being traced, and one that cannot be traced.
     """
-    if programs.is_transformed() or (jax.config.jax_disable_jit and not progress):  # type: ignore[attr-defined]
+    if programs.is_transformed() or (setting("jax_disable_jit") and not progress):
         return None
     numbers = max(FEWEST, sum(np.size(x) for x in jax.tree.leaves(inputs) if hasattr(x, "dtype")))
     if not progress and grid.num_steps * numbers < LONG:

@@ -6,13 +6,13 @@ import math
 import warnings
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.component import component
+from jeuler._core.precision import setting
 
 Checkpoint = int | Literal["sqrt", "reversible"] | None
 
@@ -60,7 +60,7 @@ def check_counter(num_steps: int, save_every: int, many: bool = False) -> None:
     """One ValueError if the run has more steps than its counter can count, which would turn time negative."""
     if num_steps <= COUNTER:
         return
-    if not many and not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+    if not many and not setting("jax_enable_x64"):
         raise ValueError(
             f"num_steps must be at most {COUNTER:,} under jit, vmap and grad where integers have 32 bits, got "
             f"{num_steps:,}; call it outside of these, or turn on 64-bit numbers"

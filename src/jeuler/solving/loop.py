@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core import checks, trees
+from jeuler._core.precision import setting
 from jeuler.solving.grid import COUNTER, Grid
 
 PyTree = Any
@@ -42,7 +43,7 @@ class Loop:
     def first_carry(self) -> PyTree:
         """What is carried from step to step, (steps taken, first step that is not finite, (y, extra)), at the start."""
         saved_form(self.save, self.grid.t0, self.start[0])
-        counter = jnp.int64 if self.grid.num_steps > COUNTER and jax.config.jax_enable_x64 else jnp.int32  # type: ignore
+        counter = jnp.int64 if self.grid.num_steps > COUNTER and setting("jax_enable_x64") else jnp.int32
         return jnp.zeros((), counter), jnp.full((), -1, counter), self.start
 
     def one_step(self, carry: PyTree, _: Any = None) -> tuple[PyTree, None]:
