@@ -130,6 +130,19 @@ def test_json_to_standard_output_link_and_pipe(folder, capsys):
     assert "natural frequency" in error
 
 
+def test_what_is_left_out_has_its_whole_reason(folder, capsys):
+    t = quirks.T[:60]
+    long = "x" * 200
+    rows = np.stack([t, quirks.swing(t), np.abs(quirks.swing(t))], 1)
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (folder / "more.csv").write_text("\n".join(["t (s),x (m)," + f"Absolute {long} (m)", *lines]))
+    _, out, _ = run(capsys, "fit", "more.csv", "--mass", 0.25, "--json", "told.json")
+    (entry,) = json.loads((folder / "told.json").read_text())["left_out"]
+    assert len(entry["reason"]) > 20
+    assert f"({entry['reason']})" in out
+    assert long not in out
+
+
 def test_names_that_a_picture_or_a_terminal_would_take_amiss(folder, capsys):
     text = (folder / "good.csv").read_text()
     (folder / "odd.csv").write_text(text.replace("t,x", "t,x$\\frac{$\x1b[31mred", 1))

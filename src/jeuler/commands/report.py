@@ -156,8 +156,9 @@ def used(result: dict[str, Any]) -> list[Fact]:
     """Which part of the recording was used, and what was left out."""
     facts = [("used", _used(result))]
     if result["left_out"]:
-        out = [f"{entry['column']} ({entry['reason']})" for entry in result["left_out"]]
-        facts.append(("left out", listed(out)))
+        out = [f"{listed([entry['column']])} ({entry['reason']})" for entry in result["left_out"]]
+        longest = max(map(len, out))  # a name may be cut, a reason not
+        facts.append(("left out", listed(out, longest=longest)))
     return facts + [("note", note) for note in result["notes"]]
 
 

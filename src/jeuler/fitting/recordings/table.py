@@ -49,7 +49,7 @@ def named(given: list[str], first: str = "") -> list[str]:
     return names
 
 
-def listed(names: list[str], most: int = 12) -> str:
-    """Names for a message: the first ones, and how many more there are."""
+def listed(names: list[str], most: int = 12, longest: int = 60) -> str:
+    """Names for a message: the first ones, long ones cut, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(name[:60] for name in names[:most]) + more
+    return ", ".join(name[:longest] for name in names[:most]) + more
