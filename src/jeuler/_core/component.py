@@ -84,17 +84,18 @@ def as_float(x: ArrayLike | None) -> Array | None:
         return x
     if isinstance(x, (int, float)) and not isinstance(x, bool):
         return jnp.asarray(float(x))
-    if any(
-        isinstance(part, jax.Array) for part in jax.tree.leaves(x)
-    ):  # NumPy cannot look at a list with traced numbers
+    if any(isinstance(part, jax.Array) for part in jax.tree.leaves(x)):  # a list with traced numbers: not for NumPy
         x = jnp.asarray(x)
     kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer) or kind == np.dtype(object)):
         raise TypeError(f"{kind} is not real")
-    if kind != np.dtype(object) and not isinstance(x, jax.Array):
-        x = jnp.asarray(np.asarray(x), jax.dtypes.canonicalize_dtype(kind))  # without a dtype, JAX compiles a program
-    x = jnp.asarray(x)
+    x = jnp.asarray(x) if isinstance(x, jax.Array) or kind == np.dtype(object) else from_numpy(np.asarray(x))
     return x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
+
+
+def from_numpy(x: np.ndarray) -> Array:
+    """An array of NumPy as one of JAX in its own dtype: without a dtype, JAX compiles a program for each new shape."""
+    return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype))
 
 
 def store_as_float(component: Any, *names: str) -> None:

@@ -13,7 +13,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import OptionalParameter, Parameter, default
 from jeuler._core.arguments import near_name, says_what_to_write
-from jeuler._core.component import component, replace, store_as_float
+from jeuler._core.component import component, from_numpy, replace, store_as_float
 from jeuler._core.components import by_component, split, stack
 
 # What a particle has in a field that nothing gave a value: (shape of one particle's value, value).
@@ -184,8 +184,8 @@ def _array(name: str, value: Any) -> Array:
     if isinstance(value, jax.Array):
         return value
     try:
-        if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":  # without a dtype, JAX compiles a program
-            return jnp.asarray(value, jax.dtypes.canonicalize_dtype(value.dtype))
+        if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
+            return from_numpy(value)
         return jnp.asarray(value)
     except (TypeError, ValueError):
         raise ValueError(f"ParticleState.{name} must be an array of numbers, got {checks.shown(value)}") from None
