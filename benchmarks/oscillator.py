@@ -36,8 +36,8 @@ def by_diffrax(y, stiffness, adjoint=diffrax.RecursiveCheckpointAdjoint):
     return solution.ys[0][0]
 
 
-def runs() -> dict:
-    """(peer, forward or gradient) to a function without arguments."""
+def runs(only: str = "") -> dict:
+    """(peer, forward or gradient) to a function without arguments; of one peer, or of all."""
     args = (jnp.float32(1.0), jnp.float32(0.0)), jnp.float32(4.0)
     peers = {
         "jeuler": by_jeuler,
@@ -47,6 +47,8 @@ def runs() -> dict:
     }
     made = {}
     for name, final in peers.items():
+        if only not in ("", name):
+            continue
         for kind, function in enumerate((final, jax.grad(final, argnums=(0, 1)))):
             compiled = jax.jit(function).lower(*args).compile()
             made[name, kind] = lambda compiled=compiled: jax.block_until_ready(compiled(*args))

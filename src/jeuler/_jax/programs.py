@@ -226,7 +226,7 @@ def _devices(dynamic: list) -> tuple:
 
 
 def is_transformed() -> bool:
-    """Whether a derivative, a batch or a program is being worked out around this call."""
+    """Whether a derivative, a batch or a program is being computed around this call."""
     return not core.trace_state_clean()
 
 

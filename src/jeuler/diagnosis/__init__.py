@@ -1,4 +1,4 @@
-"""Where a run or its gradient was lost, why, and what to do."""
+"""Where a run or its gradient stops being finite, why, and what to do."""
 
 from jeuler.diagnosis._diagnose import Diagnosis, diagnose
 

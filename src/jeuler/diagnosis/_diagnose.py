@@ -14,7 +14,7 @@ import numpy as np
 from jeuler._core import trees
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler.diagnosis.rerun import GROWN, Rerun, coincident, largest, lost_particles, springs_among
+from jeuler.diagnosis.rerun import GROWN, Rerun, coincident, largest, nonfinite_particles, springs_among
 from jeuler.particles._simulate import check_kinds
 from jeuler.particles.fields import declared, name_of
 from jeuler.particles.scene import Scene
@@ -65,7 +65,7 @@ class Diagnosis:
             for name, some in (("particle", self.particles), ("spring", self.springs))
             if some
         )
-        return f"the {self.quantity} is lost{where}, {self.part}{who}: {self.cause}; {self.remedy}"
+        return f"the {self.quantity} stops being finite{where}, {self.part}{who}: {self.cause}; {self.remedy}"
 
 
 @says_what_to_write()
@@ -101,7 +101,7 @@ def diagnose(
       >>> scene = jeuler.Scene(forces=(jeuler.Springs([[0, 1]], ks=100.0, kd=1.0, rest_length=1.0),))
       >>> state = jeuler.ParticleState(jnp.array([[0.0], [1.1]]), jnp.zeros((2, 1)))
       >>> print(jeuler.diagnose(scene, state, dt=0.5, num_steps=1000))
-      the value is lost in step ...: dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
+      the value stops being finite in step ...: dt = 0.5 s is 50 times the stability limit 0.01 s of euler_step; ...
     """
     check_kinds(scene, state)
     for name, tree in (("state", state), ("scene", scene)):
@@ -112,13 +112,15 @@ def diagnose(
             if found:
                 return found
     run = Rerun.of(scene, state, num_steps, dt=dt, t0=t0, step=step, key=key)
-    return lost_value(run, num_steps) or (lost_gradient(run, num_steps, loss) if loss else None) or Diagnosis(True)
+    return (
+        find_in_value(run, num_steps) or (find_in_gradient(run, num_steps, loss) if loss else None) or Diagnosis(True)
+    )
 
 
-def lost_value(run: Rerun, num_steps: int) -> Diagnosis | None:
+def find_in_value(run: Rerun, num_steps: int) -> Diagnosis | None:
     """The first step whose result is not finite, and what in it, or None."""
-    lost = int(run.solution(num_steps).first_nonfinite)
-    return None if lost < 0 else inside_step(run, lost)
+    n = int(run.solution(num_steps).first_nonfinite)
+    return None if n < 0 else inside_step(run, n)
 
 
 def before_the_run(field: str, leaf: Any, bad: np.ndarray) -> Diagnosis | None:
@@ -138,7 +140,7 @@ def inside_step(run: Rerun, n: int) -> Diagnosis:
             found = inside_motion(run, n, before)
             if found:
                 return found
-        bad = lost_particles(after.alive, after.position, after.velocity)
+        bad = nonfinite_particles(after.alive, after.position, after.velocity)
         if bad:
             return explain(run, "value", n, part, bad, start)
         before = after
@@ -148,16 +150,16 @@ def inside_step(run: Rerun, n: int) -> Diagnosis:
 def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None:
     """Which force, or what else in the motion of step n, is not finite, from the state that it starts from."""
     t, alive = run.time(n), before.alive
-    for effect, t_of_path in run.lost_paths(n, before):
+    for effect, t_of_path in run.nonfinite_paths(n, before):
         cause = f"the motion that it prescribes is not finite at t = {t_of_path:.6g} s"
         return Diagnosis(False, "value", n, effect, cause=cause, remedy="look at what its path divides by and takes")
     for t_of_stage, stage in run.stages(n, before):
         for part, force in run.shares(t_of_stage, stage):
-            bad = lost_particles(alive, force)
+            bad = nonfinite_particles(alive, force)
             if bad:
-                return lost_force(run, n, part, bad, stage)
+                return explain_force(run, n, part, bad, stage)
     motion, attributes = (before.position, before.velocity), run.scene.attributes(before)
-    bad = lost_particles(alive, run.of_one.equation.vector_field(t, motion, attributes)[1])
+    bad = nonfinite_particles(alive, run.of_one.equation.vector_field(t, motion, attributes)[1])
     if bad and largest(before.position) < run.huge():
         light = np.broadcast_to(before.mass, len(before.position))[bad[0]]
         cause = f"force / mass overflows {before.position.dtype}: the mass is {light:.3g} kg"
@@ -166,7 +168,7 @@ def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None
     if hasattr(run.step, "with_info"):
         equation, dt = run.of_one.equation, run.of_one.grid.dt
         after, info = run.step.with_info(equation.vector_field, t, motion, dt, attributes)
-        bad = lost_particles(alive, *after)
+        bad = nonfinite_particles(alive, *after)
         if bad:
             cause = f"its equation was not solved in {int(info.iterations)} iterations"
             remedy = "take a smaller dt, or implicit_euler(max_steps=..., damped_steps=..., rtol=...)"
@@ -174,7 +176,7 @@ def inside_motion(run: Rerun, n: int, before: ParticleState) -> Diagnosis | None
     return None
 
 
-def lost_force(run: Rerun, n: int, part: str, bad: tuple[int, ...], at: ParticleState) -> Diagnosis:
+def explain_force(run: Rerun, n: int, part: str, bad: tuple[int, ...], at: ParticleState) -> Diagnosis:
     """Why a force is not finite: a number in it, a field that it reads, or what it makes of them."""
     k = index_of(part)
     force = run.scene.forces[k]
@@ -192,7 +194,7 @@ def lost_force(run: Rerun, n: int, part: str, bad: tuple[int, ...], at: Particle
     return explain(run, "value", n, part, bad, at, springs_among(force, at, bad))
 
 
-def lost_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Diagnosis | None:
+def find_in_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Diagnosis | None:
     """Follow the cotangent of the loss back, step by step, to the first that is not finite."""
     states = run.solution(num_steps, save_every=1).y
 
@@ -210,7 +212,7 @@ def lost_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Diagn
     last = jax.tree.map(lambda x: x[-1], states)
     motion = last.position, last.velocity
     cotangent = jax.grad(lambda m: loss(dataclasses.replace(last, position=m[0], velocity=m[1])))(motion)
-    bad = lost_particles(None, *cotangent)
+    bad = nonfinite_particles(None, *cotangent)
     if bad:
         cause = "its derivative at the last state is not finite"
         remedy = "look at roots and norms of zero in the loss; write them with a double jnp.where"
@@ -218,14 +220,14 @@ def lost_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Diagn
     for n in range(num_steps, 0, -1):
         before = jax.tree.map(lambda x, n=n: x[n - 1], states)
         of_scene, pulled = pull_back(n, before, cotangent)
-        bad = lost_particles(None, *pulled)
+        bad = nonfinite_particles(None, *pulled)
         if bad or not bool(trees.all_finite(of_scene)):
-            return lost_in_step(run, n, before, cotangent, bad)
+            return gradient_in_step(run, n, before, cotangent, bad)
         cotangent = pulled
     return None
 
 
-def lost_in_step(run: Rerun, n: int, before: ParticleState, cotangent: Any, bad: tuple[int, ...]) -> Diagnosis:
+def gradient_in_step(run: Rerun, n: int, before: ParticleState, cotangent: Any, bad: tuple[int, ...]) -> Diagnosis:
     """Which part of step n made the cotangent not finite."""
     before = run.before_motion(n, before)
     t, motion = run.time(n), (before.position, before.velocity)
@@ -238,7 +240,7 @@ def lost_in_step(run: Rerun, n: int, before: ParticleState, cotangent: Any, bad:
         k = index_of(part)
         value, pullback = jax.vjp(lambda scene, x, v, part=part: force(scene, x, v, part), run.scene, *motion)
         of_scene, *of_motion = pullback(jnp.ones_like(value))
-        who = lost_particles(before.alive, *of_motion)
+        who = nonfinite_particles(before.alive, *of_motion)
         if who or not bool(trees.all_finite(of_scene.forces[k])):
             springs = springs_among(run.scene.forces[k], before, who)
             return explain(run, "gradient", n, part, who, before, springs)

@@ -91,7 +91,7 @@ class Rerun:
         for share in equation.shares(t, x, v, attributes):
             yield share.name, stack(share.force)
 
-    def lost_paths(self, n: int, before: ParticleState) -> Iterator[tuple[str, float]]:
+    def nonfinite_paths(self, n: int, before: ParticleState) -> Iterator[tuple[str, float]]:
         """Effects that prescribe what is not finite at the start or the end of step n: name and time."""
         for k, effect in enumerate(self.scene.effects):
             if hasattr(effect, "prescribe"):
@@ -159,7 +159,7 @@ class Rerun:
         return float(jnp.finfo(self.state.position.dtype).max) ** 0.75
 
 
-def lost_particles(alive: Any, *arrays: jax.Array) -> tuple[int, ...]:
+def nonfinite_particles(alive: Any, *arrays: jax.Array) -> tuple[int, ...]:
     """The particles with a number that is not finite, in arrays (particle, dim); the living ones, or all for None."""
     bad = np.any([~np.isfinite(np.asarray(x)).all(axis=-1) for x in arrays], axis=0)
     return tuple(np.flatnonzero(bad if alive is None else bad & np.asarray(alive)).tolist())

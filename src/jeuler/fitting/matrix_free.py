@@ -86,7 +86,7 @@ def _products(residual: FlatResidual, loss: str) -> Products:
 
 
 def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
-    """The fit of a problem whose Jacobian is not formed; standard errors are not worked out."""
+    """The fit of a problem whose Jacobian is not formed; standard errors are not computed."""
     if options.starts is not None or options.resume is not None:
         raise ValueError(
             f"starts and resume are for up to {problem.form.size * len(problem.x) * 8 / 2**30:.1g} GB of Jacobian; "
@@ -117,7 +117,7 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
     state = state._replace(
         total=np.asarray(total), residual=r, nonfinite=np.asarray(nonfinite), jacobian=np.zeros((0, 0))
     )
-    more = (*known.more, f"standard errors are not worked out for {len(x)} unknowns")
+    more = (*known.more, f"standard errors are not computed for {len(x)} unknowns")
     told = Known(known.variance, known.noise, more)
     return report(problem, state, history, 1.0, options.loss, words, told)
 

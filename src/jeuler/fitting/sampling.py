@@ -9,7 +9,7 @@ from jeuler.forces.springs import Springs
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
-MOST_MODES = 24  # of which the frequencies are worked out
+MOST_MODES = 24  # of which the frequencies are computed
 
 
 def aliased(given: Scene, fitted: Scene, state: ParticleState, times: np.ndarray) -> list[str]:

@@ -169,7 +169,7 @@ def inverse_root(x: Array) -> tuple[Array, Array]:
 
 @jax.custom_jvp
 def once(x: Array) -> Array:
-    """x, worked out once and stored; its cotangent is not."""
+    """x, computed once and stored; its cotangent is not."""
     return stored(x)
 
 

@@ -49,7 +49,7 @@ def coefficient(square: Array, approach: Array, ks: Array, kd: Array, rest_lengt
 
 @coefficient.defjvp
 def _coefficient_jvp(primals, tangents):
-    """Written in i = 1 / r, which is worked out once: what all derivatives share."""
+    """Written in i = 1 / r, which is computed once: what all derivatives share."""
     square, a, ks, kd, rest_length = primals
     i, a = inverse_length(square), stored(a)
     c = (ks * rest_length - kd * (a * i)) * i - ks
@@ -101,14 +101,15 @@ class Springs:
 
     def prepare(self, context: Any) -> PreparedSprings | None:
         """The springs between the living, laid out for the kernels; None where there are no springs."""
-        return self.laid_out(context.particles, context.dtype).prepare(context) if len(self.edges) else None
+        springs = self.laid_out(context.particles, context.dtype, context.limits_drag)
+        return springs.prepare(context) if len(self.edges) else None
 
-    def laid_out(self, particles: int, dtype: Any) -> PreparedSprings:
+    def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedSprings:
         """The same force with its parameters in the slots of each layout, which is the same work at every step."""
         layouts = self.edges.layouts(particles)
         parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
         slots = ([layout.to_slots(x) for layout in layouts] for x in parameters)
-        return PreparedSprings(self.edges, layouts, *slots)
+        return PreparedSprings(self.edges, layouts, read_again, *slots)
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks (r - L)^2 / 2, J."""
@@ -128,12 +129,13 @@ class Springs:
         check_limits(self)
 
 
-@component(static=("edges", "layouts"))
+@component(static=("edges", "layouts", "read_again"))
 class PreparedSprings:
     """Springs as the kernels take them, with the parameters in the slots of each layout."""
 
     edges: Topology
     layouts: tuple[Layout, ...]
+    read_again: bool  # see `Layout.central_force`
     ks: Any
     kd: Any
     rest_length: Any
@@ -142,7 +144,7 @@ class PreparedSprings:
         x, v = split(position), split(velocity)
         total = [jnp.zeros_like(component) for component in x]
         for layout, *parameters in zip(self.layouts, self.ks, self.kd, self.rest_length, strict=True):
-            shares = layout.central_force(coefficient, x, v, parameters)
+            shares = layout.central_force(coefficient, x, v, parameters, self.read_again)
             total = [a + b for a, b in zip(total, shares, strict=True)]
         return stack(total)
 

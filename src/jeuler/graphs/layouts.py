@@ -40,11 +40,17 @@ class Layout(abc.ABC):
 
     @abc.abstractmethod
     def central_force(
-        self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
+        self,
+        law: Law,
+        x: Sequence[Array],
+        v: Sequence[Array],
+        parameters: Sequence[list[Array] | Array],
+        read_again: bool = False,
     ) -> list[Array]:
         """B^T (c B x) with c = law(|B x|^2, (B v).(B x), *parameters): (particle,) for each component of x.
 
-        Parameters are what `to_slots` made of them.
+        Parameters are what `to_slots` made of them. ``read_again``: more than one kernel reads the force, as one does
+        that limits a quadratic drag.
         """
 
     def to_slots(self, x: Array) -> list[Array] | Array:
@@ -70,9 +76,14 @@ class Indexed(Layout):
     tables: tuple[np.ndarray, ...]
 
     def central_force(
-        self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
+        self,
+        law: Law,
+        x: Sequence[Array],
+        v: Sequence[Array],
+        parameters: Sequence[list[Array] | Array],
+        read_again: bool = False,
     ) -> list[Array]:
-        # both ends read one slot: d is stored, its cotangent too, not worked out again for either
+        # both ends read one slot: d is stored, its cotangent too, not computed again for either
         d = [stored(self.difference(component)) for component in x]
         s = [self.difference(component) for component in v]
         c = stored(law(dot(d, d), dot(s, d), *(parameter for (parameter,) in parameters)))
@@ -115,13 +126,20 @@ class Shifts(Layout):
         self.slot_edges: tuple[np.ndarray, ...] = tuple(groups)
 
     def central_force(
-        self, law: Law, x: Sequence[Array], v: Sequence[Array], parameters: Sequence[list[Array] | Array]
+        self,
+        law: Law,
+        x: Sequence[Array],
+        v: Sequence[Array],
+        parameters: Sequence[list[Array] | Array],
+        read_again: bool = False,
     ) -> list[Array]:
         x, v = ([kept(component) for component in y] for y in (x, v))
         squares, approaches = (self.dot_differences(y, x) for y in (x, v))
         values = map(law, squares, approaches, *map(self.by_group, parameters))
         c = [stored(jnp.where(edges < 0, 0, value)) for edges, value in zip(self.slot_edges, values, strict=True)]
-        return [laplacian(c, kept(component), self.offsets) for component in x]
+        if read_again:  # without this, XLA computes the edges again for each reader: a gradient 2 to 3 times slower
+            x = [kept(component) for component in x]
+        return [laplacian(c, component, self.offsets) for component in x]
 
     def dot_differences(self, x: Sequence[Array], y: Sequence[Array]) -> list[Array]:
         """(B x).(B y), one array a group."""

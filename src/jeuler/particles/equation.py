@@ -73,7 +73,9 @@ class Equation:
 
     @classmethod
     def of(cls, forces: Iterable[Any], effects: Iterable[Any], context: Context) -> Equation:
-        prepared = []
+        forces, prepared = tuple(forces), []
+        limited = context.step is not None and is_explicit_of_first_order(context.step)
+        context = dataclasses.replace(context, limits_drag=limited and any(hasattr(f, "drag") for f in forces))
         for k, force in enumerate(forces):
             kernel = force.prepare(context) if hasattr(force, "prepare") else force
             if kernel is not None:
@@ -118,13 +120,12 @@ class Equation:
         """What each force adds to the sum. Each gets arrays of its own: so derivatives too are summed by component."""
         mass = jnp.broadcast_to(attributes.mass, x[0].shape) if x else attributes.mass
         context = dataclasses.replace(self.context, alive=attributes.alive)
-        limited = self.context.step is not None and is_explicit_of_first_order(self.context.step)
         for name, reads, kernel in self.forces:
             if attributes.alive is not None and hasattr(kernel, "prepare"):
                 kernel = kernel.prepare(context)
                 if kernel is None:
                     continue
-            if limited and hasattr(kernel, "drag"):
+            if self.context.limits_drag and hasattr(kernel, "drag"):
                 drag = kernel.drag(t, stack(x)).through(v)
                 yield Share(name, drag.force(), drag)
             else:

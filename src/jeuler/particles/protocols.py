@@ -27,6 +27,7 @@ class Context:
       dt: size of the step, s; None outside of a run, as in `solve(scene.vector_field, ...)`.
       step: the method; None outside of a run.
       alive: (particle,), who lives; None before the first step, and where no particle is born or dies.
+      limits_drag: whether drags are limited in this step, so that the sum of the other forces is read more than once.
     """
 
     particles: int
@@ -34,6 +35,7 @@ class Context:
     dt: Array | None = None
     step: Step | None = None
     alive: Array | None = None
+    limits_drag: bool = False
 
 
 class Force(Protocol):

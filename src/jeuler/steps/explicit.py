@@ -166,10 +166,10 @@ def runge_kutta_increment(tableau: Tableau, f: VectorField, t: Any, y: PyTree, d
 
 
 def stored_stage(stage: PyTree) -> PyTree:
-    """The state of a stage, and its cotangent, each worked out once.
+    """The state of a stage, and its cotangent, each computed once.
 
     A field that takes a state apart, y[0], y[1], ..., has its cotangent as a sum of padded parts. Without this, XLA on
-    CPU works out each part anew from all parts of the stage after it, and a turn of the loop is no longer one kernel:
+    CPU computes each part anew from all parts of the stage after it, and a turn of the loop is no longer one kernel:
     the gradient of a run of Lorenz's equations took 50 times longer.
     """
 
