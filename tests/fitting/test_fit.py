@@ -135,3 +135,47 @@ def test_no_more_residuals_than_parameters():
 def test_bad_input(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(("unit", "explains"), [(1.0, True), (1e-9, True), (None, False)])
+def test_the_share_explained_is_known_where_data_are_what_the_model_is_compared_with(unit, explains):
+    """Not where they are what the model is a function of."""
+    x = np.linspace(0, 1, 40)
+    y = (unit or 1.0) * (3 * x + 0.5 * np.sin(25 * x))
+    if unit is None:
+        found = jeuler.fit(lambda p, x: p["a"] * x - y, {"a": 1.0}, data=x)
+        assert found.explained is None
+        return
+    found = jeuler.fit(lambda p, y: p["a"] * x - y, {"a": unit}, data=y, priors={"a": (0.0, 1e9)}, sigma=unit)
+    np.testing.assert_allclose(
+        found.explained, 1 - np.sum((found.params["a"] * x - y) ** 2) / np.sum((y - y.mean()) ** 2)
+    )
+
+
+def lorenz(t, y, p):
+    x, v, z = y
+    return jnp.stack([p["s"] * (v - x), x * (p["r"] - z) - v, x * v - p["b"] * z])
+
+
+def test_a_chaotic_record_ends_at_the_truth_or_says_what_is_wrong():
+    """30 s of Lorenz's equations: only the growing horizon reaches the truth from (5, 20, 1)."""
+    t, truth = np.linspace(0, 30, 301), {"s": 10.0, "r": 28.0, "b": 8 / 3}
+
+    def model(p):
+        start = jnp.ones(3)
+        return jeuler.solve(lorenz, start, dt=0.01, num_steps=3000, save_every=10, step=jeuler.rk4_step, args=p).y
+
+    def residual(p, y):
+        return model(p) - y
+
+    y, start = np.asarray(model(truth)), {"s": 5.0, "r": 20.0, "b": 1.0}
+    wrong = jeuler.fit(residual, start, data=y, max_iterations=40)
+    assert not wrong.converged
+    assert wrong.explained < 0.5
+    for words in ("stopped before it converged", "explains only", "fit the first part", "not those of a minimum"):
+        assert words in wrong.message
+    horizons = [np.repeat(t <= end, 3).astype(float) for end in (1, 2, 4, 8, 15)]
+    right = jeuler.fit(residual, start, data=y, stages=horizons)
+    assert right.converged
+    assert right.explained > 1 - 1e-9
+    np.testing.assert_allclose([right.params[name] for name in truth], list(truth.values()), rtol=1e-6)

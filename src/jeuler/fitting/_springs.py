@@ -159,7 +159,7 @@ def fit_springs(
       step: the method, as in `solve`.
       optimizer: None for Levenberg-Marquardt, or any optax optimiser, as in `fit`.
       max_iterations: the most iterations in each stage.
-      tolerance: stop when the loss decreases by less than this share.
+      tolerance: how near the minimum must be, in standard errors, by the linear model, as in `fit`.
       grow: from given values, fit the first sixteenth of the time span first, then twice as much and so on: what keeps
         an oscillation's fit out of wrong periods. False fits all of it at once.
       step_bias: solve once more at dt / 2 and report how far the integrator's error moves each parameter.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jeuler.fitting.beside import attach
@@ -12,6 +13,7 @@ from jeuler.fitting.kept import Record
 from jeuler.fitting.least_squares import State, Task
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import TUNING, Watch, progress_bar, search
+from jeuler.fitting.observations import variance_of
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import Problem, programs
 from jeuler.fitting.profiles import AGAIN, Again
@@ -35,9 +37,9 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
         from jeuler.fitting.traced import run_traced
 
         return Outcome(run_traced(problem, options), None)
-    known = known or Known()
     evaluate, task = programs(problem.residual, problem.data), problem.task(options.tolerance)
     x = np.asarray(problem.x, float)
+    known = known or Known(_variance(problem, evaluate, x))
     if not problem.small and options.optimizer is None:
         from jeuler.fitting.matrix_free import run_matrix_free
 
@@ -73,6 +75,25 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
         task = task._replace(spread=np.asarray(found.spread))
         attach(fit, AGAIN, _again(problem, evaluate, options.loss, task, state, fit))
     return Outcome(fit, state)
+
+
+def _variance(problem: Problem, evaluate: Any, x: np.ndarray) -> float | None:
+    """Weighted sum of squares of the data about their means, where the residual is a model minus all of them."""
+    shapes = [shape for shape in problem.form.shapes if shape is not None]
+    shapes = shapes if problem.residual.priors is None else shapes[:-1]
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(problem.data)]
+    if not problem.small or [leaf.shape for leaf in leaves] != shapes or any(leaf.dtype.kind != "f" for leaf in leaves):
+        return None
+    flat = np.concatenate([leaf.ravel() for leaf in leaves]).astype(float)
+    moved = jax.tree.map(lambda leaf: np.asarray(leaf) + (1 + np.abs(leaf)), problem.data)
+    before, after = (evaluate.at(x, data)[0][: len(flat)] for data in (problem.data, moved))
+    if not np.allclose(before - after, 1 + np.abs(flat), rtol=1e-3, atol=0):
+        return None
+    weights, total = np.asarray(problem.weights, float)[: len(flat)], 0.0
+    for leaf, own in zip(leaves, np.split(weights, np.cumsum([leaf.size for leaf in leaves])[:-1]), strict=True):
+        shape = (len(leaf), -1) if leaf.ndim else (1, 1)
+        total += variance_of(leaf.reshape(shape).astype(float), own.reshape(shape)) or 0.0
+    return total or None
 
 
 def _again(problem: Problem, evaluate: Any, loss: str, task: Task, state: State, fit: Fit) -> Again:

@@ -130,9 +130,13 @@ class Forward:
 
         def kept(x):
             scene, state = prediction.places.put(data["scene"], data["state"], self.layout.params(x))
-            step = RK4_IN_A_LOOP if prediction.step is rk4_step else prediction.step
             advance, state = begin(
-                scene, state, dt=data["dt"], num_steps=prediction.num_steps, t0=data["t0"], step=step
+                scene,
+                state,
+                dt=data["dt"],
+                num_steps=prediction.num_steps,
+                t0=data["t0"],
+                step=in_a_loop(prediction.step),
             )
             return _kept(advance, split_state(state), row, steps, self.nodes)
 
@@ -203,3 +207,8 @@ class RungeKuttaInALoop:
 
 
 RK4_IN_A_LOOP = RungeKuttaInALoop()
+
+
+def in_a_loop(step: Any) -> Any:
+    """The step, with its stages in a loop if there is such a form of it."""
+    return RK4_IN_A_LOOP if step is rk4_step else step

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from jeuler._core.files import check_output, write_atomically
-from jeuler.fitting.least_squares import State
 
 
 @dataclasses.dataclass
@@ -40,7 +39,7 @@ class Record:
             digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
         return cls(os.fspath(path), digest.hexdigest())
 
-    def save(self, stage: int, state: State, history: list[float]) -> None:
+    def save(self, stage: int, state: Any, history: list[float]) -> None:
         """Write where the search is, if the last time is long enough ago."""
         begun = time.monotonic()
         if begun - self.last < self.pause:
@@ -55,8 +54,8 @@ class Record:
         self.last = time.monotonic()
         self.pause = max(0.5, 20 * (self.last - begun))
 
-    def load(self) -> tuple[int, State, list[float]] | None:
-        """Where the search was, or None if there is no file yet."""
+    def load(self, kind: Any) -> tuple[int, Any, list[float]] | None:
+        """Where the search was, a NamedTuple of this kind, or None if there is no file yet."""
         if not os.path.exists(self.path) or os.path.getsize(self.path) == 0:
             return None
         try:
@@ -66,7 +65,7 @@ class Record:
                         f"resume={self.path!r} holds another fit (other data, start or parameters); "
                         f"give another path, or delete the file"
                     )
-                state = State(**{name: kept[name] for name in State._fields})
+                state = kind(**{name: kept[name] for name in kind._fields})
                 return int(kept["_stage"]), state, kept["_history"].tolist()
         except (zipfile.BadZipFile, KeyError, EOFError, OSError):
             raise ValueError(f"resume={self.path!r} is not the state of a fit; give another path") from None

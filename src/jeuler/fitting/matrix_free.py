@@ -1,54 +1,78 @@
 """Levenberg-Marquardt for many unknowns: products with the Jacobian and its transpose, and no Jacobian.
 
-The linear problem of each step is solved by conjugate gradients (`lineax.CG`). optimistix's Levenberg-Marquardt can be
-given that solver too, but not bounds, nor a scale for each unknown, without which such a solver hardly converges here.
+The linear problem of each step is solved by conjugate gradients. They are written out here: `lineax.CG` and
+`jax.scipy.sparse.linalg.cg` compile the product two or three times, and a product, which is a run forwards and one
+backwards, takes longer to compile than all its runs take; nor do they give the decrease that the step is to make.
+optimistix's Levenberg-Marquardt has no bounds, nor a scale for each unknown, without which it hardly converges here.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from jeuler.fitting.least_squares import Task, start
+from jeuler._core.partition import OfArrays
+from jeuler.fitting.kept import Record
+from jeuler.fitting.least_squares import CONVERGED, NOT_FINITE, RUNNING, STALLED, Task, start
 from jeuler.fitting.losses import LOSSES
-from jeuler.fitting.minimise import progress_bar
+from jeuler.fitting.minimise import Watch, progress_bar
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import FlatResidual, Problem
-from jeuler.fitting.report import NOT_FINITE, report
+from jeuler.fitting.report import NOT_FINITE as WITHOUT_A_START
+from jeuler.fitting.report import ending, report
 from jeuler.fitting.result import Fit
 
 PROBES = 8  # random directions that estimate the norms of the columns
-MOST_PRODUCTS = 150  # iterations of conjugate gradients in one step
-ACCURACY = 1e-2  # of a step, relative
+MOST_PRODUCTS = 300  # iterations of conjugate gradients in one step
+ACCURACY = 0.05  # of the decrease that a step makes, relative
 NEAR = 0.05  # standard errors, root mean square over the unknowns: such a step is the last
+
+
+class Point(NamedTuple):
+    """Where a search is."""
+
+    x: np.ndarray
+    cost: np.ndarray  # sum of the losses of what counts; inf before it was computed
+    total: np.ndarray  # sum of squares over the same
+    residual: np.ndarray  # weighted
+    held: np.ndarray  # which unknowns stay at a bound
+    damping: np.ndarray
+    growth: np.ndarray
+    iterations: np.ndarray
+    nonfinite: np.ndarray
+    status: np.ndarray
 
 
 class Products(NamedTuple):
     """The compiled programs of a residual."""
 
     cost: Any
-    norms: Any
     step: Any
+
+
+def quick_to_compile(residual: FlatResidual) -> FlatResidual:
+    """The residual with its steps written in loops, where it has such a form of itself, ``in_loops``."""
+    function: Any = residual.residual
+    if isinstance(function, OfArrays) and hasattr(function.function, "in_loops"):
+        function = dataclasses.replace(function, function=function.function.in_loops())
+    elif hasattr(function, "in_loops"):
+        function = function.in_loops()
+    return dataclasses.replace(residual, residual=function)
 
 
 @functools.lru_cache(maxsize=8)
 def _products(residual: FlatResidual, loss: str) -> Products:
-    """Cost, norms of columns and damped step of a residual; kept, so that a fit of the same shape uses them again."""
-    import lineax
-
-    rho = LOSSES[loss]
+    """Cost and damped step of a residual; kept, so that a fit of the same shape uses them again."""
+    rho, residual = LOSSES[loss], quick_to_compile(residual)
 
     def weighted(x: Array, task: Task) -> Array:
         return jnp.where(task.weights > 0, residual(x, task.data) * task.weights, 0)
-
-    def bent(x: Array, task: Task) -> tuple[Array, Array]:
-        r = weighted(x, task)
-        return r, rho(r / task.spread)[1]
 
     @jax.jit
     def cost(x: Array, task: Task) -> tuple[Array, Array, Array]:
@@ -56,110 +80,154 @@ def _products(residual: FlatResidual, loss: str) -> Products:
         return jnp.sum(rho(r / task.spread)[0]) * task.spread**2, jnp.sum(r**2), r
 
     @jax.jit
-    def norms(x: Array, task: Task) -> Array:
-        r, slope = bent(x, task)
-        _, transpose = jax.vjp(lambda x: weighted(x, task), x)
+    def step(x: Array, task: Task, held: Array, damping: Array) -> tuple[Array, Array, Array]:
+        r, forwards = jax.linearize(lambda x: weighted(x, task), x)
+        backwards = jax.linear_transpose(forwards, x)
+        slope = rho(r / task.spread)[1]
         signs = jax.random.rademacher(jax.random.key(0), (PROBES, len(r)), x.dtype)
-        return jnp.sqrt(jax.lax.map(lambda sign: transpose(slope * sign)[0] ** 2, signs).mean(axis=0))
-
-    @jax.jit
-    def step(x: Array, task: Task, scale: Array, held: Array, damping: Array) -> tuple[Array, Array, Array]:
-        r, slope = bent(x, task)
-        function = lambda x: weighted(x, task)  # noqa: E731  # read twice below
-        _, transpose = jax.vjp(function, x)
+        rows = lax.map(lambda row: backwards(slope * row)[0], jnp.concatenate([(slope * r)[None], signs]))
+        gradient, norms = rows[0], jnp.sqrt(jnp.mean(rows[1:] ** 2, axis=0))
+        largest = jnp.max(norms)
+        scale = jnp.where(norms > 1e-6 * largest, norms, jnp.maximum(largest, jnp.finfo(x.dtype).tiny))
         unit = jnp.where(held, 0, 1 / scale)
 
         def normal(s: Array) -> Array:
-            _, change = jax.jvp(function, (x,), (unit * s,))
-            return unit * transpose(slope**2 * change)[0] + jnp.where(held, 1, damping) * s
+            return unit * backwards(slope**2 * forwards(unit * s))[0] + damping * s
 
-        gradient = transpose(slope**2 * r)[0]
-        form = jax.ShapeDtypeStruct(x.shape, x.dtype)
-        operator = lineax.FunctionLinearOperator(normal, form, lineax.positive_semidefinite_tag)
-        solver = lineax.CG(rtol=ACCURACY, atol=0.0, max_steps=MOST_PRODUCTS)
-        solution = lineax.linear_solve(operator, -unit * gradient, solver, throw=False).value
-        _, change = jax.jvp(function, (x,), (unit * solution,))
-        decrease = -(2 * jnp.sum(gradient * unit * solution) + jnp.sum((slope * change) ** 2))
-        return unit * solution, decrease, gradient
+        s, left = conjugate_gradients(normal, -unit * gradient)
+        decrease = jnp.sum(s * (left - unit * gradient)) + damping * jnp.sum(s**2)
+        return unit * s, decrease, gradient
 
-    return Products(cost, norms, step)
+    return Products(cost, step)
+
+
+def conjugate_gradients(product: Any, b: Array) -> tuple[Array, Array]:
+    """s with A s = b, nearly, and b - A s: stopped when going on would hardly decrease s^T A s / 2 - b^T s further.
+
+        n (Q_n - Q_(n-1)) < accuracy Q_n
+
+    Args:
+      product: s -> A s, symmetric and positive semidefinite.
+      b: (n,).
+    Source: S. G. Nash, A. Sofer, Assessing a search direction within a truncated-Newton method, Operations Research
+      Letters 9, 1990 (when to stop).
+    """
+
+    def goes_on(carry: Any) -> Any:
+        _, _, _, square, gained, total, n = carry
+        return (n < MOST_PRODUCTS) & (square > 0) & (n * gained >= ACCURACY * total)
+
+    def turn(carry: Any) -> Any:
+        s, left, direction, square, _, total, n = carry
+        image = product(direction)
+        bend = jnp.sum(direction * image)
+        length = jnp.where(bend > 0, square / jnp.where(bend > 0, bend, 1), 0)
+        s, left = s + length * direction, left - length * image
+        new = jnp.where(bend > 0, jnp.sum(left**2), 0)
+        gained = length * square
+        return s, left, left + new / square * direction, new, gained, total + gained, n + 1
+
+    zero = jnp.zeros((), b.dtype)
+    s, left, *_ = lax.while_loop(goes_on, turn, (jnp.zeros_like(b), b, b, jnp.sum(b**2), zero, zero, 0))
+    return s, left
 
 
 def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
     """The fit of a problem whose Jacobian is not formed; standard errors are not computed."""
-    if options.starts is not None or options.resume is not None:
+    if options.starts is not None:
         raise ValueError(
-            f"starts and resume are for up to {problem.form.size * len(problem.x) * 8 / 2**30:.1g} GB of Jacobian; "
-            f"leave them out for {len(problem.x)} unknowns"
+            f"starts must be None for {len(problem.x)} unknowns, got {options.starts!r}; start at one place"
         )
     task = problem.task(options.tolerance)
     spread = options.loss_scale if options.loss_scale is not None else 1.345 * (known.noise or 1.0)
     task = task._replace(spread=np.asarray(spread if options.loss != "linear" else 1.0))
-    products = _products(problem.residual, options.loss)
-    x = np.asarray(problem.x, float)
-    history: list[float] = []
-    nonfinite, words, r = 0, "", np.zeros(problem.form.size)
-    total = np.inf
+    products, x, record = _products(problem.residual, options.loss), np.asarray(problem.x, float), None
+    if options.resume is not None:
+        record = Record.of(options.resume, task, problem.stages, x, repr(problem.layout.shapes), options.loss)
+    kept = None if record is None else record.load(Point)
+    first, point, history = (0, beginning(x, problem.form.size), []) if kept is None else kept
     with progress_bar(options.progress, options.max_iterations) as bar:
-        for mask in (*problem.stages, task.all_weights):
-            try:
-                x, total, r, lost, words = _descend(products, x, task._replace(weights=mask), options, history, bar)
-            except KeyboardInterrupt:
-                if not history:
-                    raise
-                words = "interrupted: the best so far"
-            nonfinite += lost
-            if words.startswith("interrupted"):
-                break
-    if not np.isfinite(total):
-        raise ValueError(NOT_FINITE)
-    state = start(x, problem.form.size, 1)
-    state = state._replace(
-        total=np.asarray(total), residual=r, nonfinite=np.asarray(nonfinite), jacobian=np.zeros((0, 0))
-    )
+        watch = Watch(bar, record)
+        for stage, mask in enumerate((*problem.stages, task.all_weights)):
+            if stage < first or watch.interrupted:
+                continue
+            if stage > first or kept is None:
+                point = beginning(point.x, problem.form.size, point.nonfinite)
+            point = descend(products, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
+    if not np.isfinite(point.total):
+        raise ValueError(WITHOUT_A_START)
+    state = start(point.x, problem.form.size, 1)._replace(jacobian=np.zeros((0, 0)))
+    state = state._replace(**{name: getattr(point, name) for name in ("total", "residual", "nonfinite", "status")})
     more = (*known.more, f"standard errors are not computed for {len(x)} unknowns")
     told = Known(known.variance, known.noise, more)
-    return report(problem, state, history, 1.0, options.loss, words, told)
+    return report(problem, state, history, 1.0, options.loss, ending(state, watch), told)
 
 
-def _descend(
-    products: Products, x: np.ndarray, task: Task, options: Options, history: list[float], bar: Any
-) -> tuple[np.ndarray, float, np.ndarray, int, str]:
-    """Damped steps to the minimum: the point, its sum of squares, its residual, and how it ended."""
-    cost, total, r = (np.asarray(a, float) for a in products.cost(x, task))
-    if not np.isfinite(cost):
-        return x, np.inf, r, 1, "the residual is not finite"
-    norms = np.asarray(products.norms(x, task), float)
-    scale = np.where(norms > 1e-6 * norms.max(initial=0), norms, max(norms.max(initial=0), 1e-300))
-    held, damping, growth, lost = np.zeros(len(x), bool), 0.0, 2.0, 0
+def beginning(x: np.ndarray, m: int, nonfinite: Any = 0) -> Point:
+    """The point before anything has been evaluated."""
+    unknown, count = np.asarray(np.inf), np.asarray(0)
+    still = np.zeros(len(x), bool), np.asarray(0.0), np.asarray(2.0)
+    return Point(x, unknown, unknown, np.zeros(m), *still, count, np.asarray(nonfinite), np.asarray(RUNNING))
+
+
+def descend(
+    products: Products, point: Point, task: Task, most: int, stage: int, history: list[float], watch: Watch
+) -> Point:
+    """Damped steps to the minimum, or to what can be had of it."""
+    try:
+        if not np.isfinite(point.cost):
+            cost, total, r = (np.asarray(a, float) for a in products.cost(point.x, task))
+            point = point._replace(cost=cost, total=total, residual=r)
+            if not np.isfinite(cost):
+                return point._replace(nonfinite=point.nonfinite + 1, status=np.asarray(NOT_FINITE))
+        while point.status == RUNNING and point.iterations < most:
+            before = point.iterations
+            point = _iterate(products, point, task)
+            counted = bool(point.iterations > before)
+            history += [float(point.total)] * counted
+            watch.see(stage, point, history, counted)
+    except KeyboardInterrupt:
+        if np.isinf(point.cost):
+            raise
+        watch.interrupted = True
+    return point
+
+
+def _iterate(products: Products, point: Point, task: Task) -> Point:
+    """One damped step, taken or not."""
+    x, damping = point.x, point.damping
+
+    def solved(held: np.ndarray) -> list[np.ndarray]:
+        return [np.asarray(a, float) for a in products.step(x, task, held, damping)]
+
+    step, decrease, gradient = solved(point.held)
+    held = ((x <= task.lower) & (gradient > 0)) | ((x >= task.upper) & (gradient < 0))
+    if (held != point.held).any():
+        step, decrease, gradient = solved(held)
     freedom = max(int(np.sum(task.weights > 0)) - len(x), 1)
-    for _ in range(options.max_iterations):
-        step, decrease, gradient = (
-            np.asarray(a, float) for a in products.step(x, task, scale, held, np.asarray(damping))
+    offset = np.sqrt(max(float(decrease), 0.0) / len(x) / (max(float(point.cost - decrease), 1e-300) / freedom))
+    near = damping == 0 and (offset <= NEAR or decrease <= 1e2 * task.precision * point.cost)
+    trial = np.clip(x + step, task.lower, task.upper)
+    cost, total, r = (np.asarray(a, float) for a in products.cost(trial, task))
+    gain = float(point.cost - cost) / max(float(decrease), 1e-300)
+    nonfinite = point.nonfinite + (not np.isfinite(cost))
+    if np.isfinite(cost) and cost < point.cost and gain > (1e-3 if damping else 0.1):
+        damping = damping * (0.1 if gain > 0.75 else 0.5)
+        return Point(
+            trial,
+            cost,
+            total,
+            r,
+            held,
+            np.asarray(damping if damping > 1e-6 else 0.0),
+            np.asarray(2.0),
+            point.iterations + 1,
+            nonfinite,
+            np.asarray(CONVERGED if near and gain > 0.5 else RUNNING),
         )
-        free = ~(((x <= task.lower) & (gradient > 0)) | ((x >= task.upper) & (gradient < 0)))
-        if (free == held).any():  # another set is held at its bounds: solve with that one
-            held = ~free
-            step, decrease, gradient = (
-                np.asarray(a, float) for a in products.step(x, task, scale, held, np.asarray(damping))
-            )
-        trial = np.clip(x + step, task.lower, task.upper)
-        offset = np.sqrt(max(float(decrease), 0) / len(x) / (max(float(cost - decrease), 1e-300) / freedom))
-        there = [np.asarray(a, float) for a in products.cost(trial, task)]
-        lost += not np.isfinite(there[0])
-        gain = (cost - there[0]) / max(float(decrease), 1e-300)
-        if np.isfinite(there[0]) and there[0] < cost and gain > (1e-3 if damping else 0.1):
-            x, (cost, total, r) = trial, there
-            damping, growth = damping * (0.1 if gain > 0.75 else 0.5), 2.0
-            damping = damping if damping > 1e-6 else 0.0
-            history.append(float(total))
-            bar.update()
-            if offset <= NEAR and gain > 0.5:
-                return x, float(total), r, lost, "converged"
-        else:
-            if decrease <= 1e2 * float(task.precision) * cost or offset <= NEAR:
-                return x, float(total), r, lost, "converged"
-            damping, growth = max(damping * growth, 1e-3), growth * 2
-            if growth > 1e12:
-                break
-    return x, float(total), r, lost, "stopped before it converged: allow more iterations or start closer"
+    flat = near and abs(gain) <= 1  # worse by less than was to be gained: rounding
+    status = CONVERGED if flat else STALLED if point.growth > 1e12 else RUNNING
+    damping = np.asarray(max(damping * point.growth, 1e-3))
+    return point._replace(
+        held=held, damping=damping, growth=point.growth * 2, nonfinite=nonfinite, status=np.asarray(status)
+    )

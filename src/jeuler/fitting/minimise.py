@@ -36,7 +36,7 @@ class Watch:
     record: Record | None = None
     interrupted: bool = False
 
-    def see(self, stage: int, state: State, history: list[float], counted: bool) -> None:
+    def see(self, stage: int, state: Any, history: list[float], counted: bool) -> None:
         if counted:
             self.bar.update()
             self.bar.set_postfix_str(f"loss {history[-1]:.4g}" if history else "", refresh=False)
@@ -78,7 +78,7 @@ def search(
     plan += [(squares, task.all_weights, task.tolerance if not robust else ROUGH), *robust]
     state, first = start(x, len(task.weights), max_iterations), 0
     history: list[float] = []
-    if watch.record is not None and (kept := watch.record.load()) is not None:
+    if watch.record is not None and (kept := watch.record.load(State)) is not None:
         first, state, history = kept
     bend = 1.0
     for number, (own_loss, weights, tolerance) in enumerate(plan):

@@ -8,6 +8,7 @@ import numpy as np
 
 MOST_TURNS = 60
 DENSE = 500  # unknowns up to which singular values are given
+SAMPLE = 12  # of more unknowns than that, those of which the error is computed: a solution for each
 UNSEEN = 1e-9  # a column shorter than this share of the longest says nothing
 
 
@@ -48,7 +49,6 @@ def nonnegative_least_squares(
 def _exchange(gram: Any, slope: np.ndarray, positive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Block principal pivoting; and the roots of the diagonal of the inverse, roughly, for the errors."""
     from scipy.sparse import identity
-    from scipy.sparse.linalg import splu
 
     n = len(slope)
     ridge = 1e-12 * identity(n, format="csc")
@@ -58,7 +58,7 @@ def _exchange(gram: Any, slope: np.ndarray, positive: np.ndarray) -> tuple[np.nd
     x = np.zeros(n)
     for _ in range(MOST_TURNS):
         free = np.flatnonzero(~held)
-        factor = splu(gram[free][:, free]) if len(free) else None
+        factor = _factor(gram[free][:, free]) if len(free) else None
         x = np.zeros(n)
         if factor is not None:
             x[free] = factor.solve(slope[free])
@@ -75,19 +75,22 @@ def _exchange(gram: Any, slope: np.ndarray, positive: np.ndarray) -> tuple[np.nd
             wrong = np.arange(n) == np.flatnonzero(wrong)[-1]
         held ^= wrong
     x = np.where(positive, np.maximum(x, 0), x)
-    return x, _inverse_diagonal(gram, held, n)
+    return x, _inverse_diagonal(factor, free, n)
 
 
-def _inverse_diagonal(gram: Any, held: np.ndarray, n: int) -> np.ndarray:
-    """Roots of the diagonal of the inverse: exact for few unknowns, of a sample of columns for many."""
+def _factor(gram: Any) -> Any:
+    """Of a symmetric, positive definite matrix, without pivots: the order of its pattern fills in the least."""
     from scipy.sparse.linalg import splu
 
-    free = np.flatnonzero(~held)
+    return splu(gram, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _inverse_diagonal(factor: Any, free: np.ndarray, n: int) -> np.ndarray:
+    """Roots of the diagonal of the inverse: exact for few unknowns, of a sample of columns for many."""
     root = np.ones(n)
-    if not len(free):
+    if factor is None:
         return root
-    factor = splu(gram[free][:, free])
-    sample = free if len(free) <= DENSE else free[:: len(free) // 100]
+    sample = free if len(free) <= DENSE else free[:: len(free) // SAMPLE]
     position = {k: place for place, k in enumerate(free)}
     rhs = np.zeros((len(free), len(sample)))
     places = np.array([position[k] for k in sample])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -91,14 +92,21 @@ def noise_of(times: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> flo
     width, kept, squares = 7, 0, 0.0
     for column, weight in zip(columns.T, weights.T, strict=True):
         seen = np.isfinite(column) & (weight > 0)
-        t, x, w = times[seen], column[seen], weight[seen]
-        if len(t) < width + 2 or (np.diff(t) <= 0).any():
+        contrast = _contrast(np.asarray(times[seen], float).tobytes(), width)
+        if contrast is None:
             continue
-        windows = np.lib.stride_tricks.sliding_window_view(t, width)
-        place = (windows - windows.mean(axis=1, keepdims=True)) / np.ptp(windows, axis=1)[:, None]
-        products = np.prod(place[:, :, None] - place[:, None, :] + np.eye(width), axis=2)
-        contrast = 1 / products  # the highest divided difference: orthogonal to all lower polynomials
-        contrast /= np.linalg.norm(contrast, axis=1, keepdims=True)
-        left = np.sum(contrast * np.lib.stride_tricks.sliding_window_view(x * w, width), axis=1)
+        left = np.sum(contrast * np.lib.stride_tricks.sliding_window_view((column * weight)[seen], width), axis=1)
         squares, kept = squares + float(np.sum(left**2)), kept + len(left)
     return float(np.sqrt(squares / kept)) if kept and squares > 0 else None
+
+
+@functools.lru_cache(maxsize=8)  # most columns were seen at the same times
+def _contrast(seen_at: bytes, width: int) -> np.ndarray | None:
+    """Weights of neighbouring samples, orthogonal to all polynomials of less than the highest degree, of norm one."""
+    times = np.frombuffer(seen_at)
+    if len(times) < width + 2 or (np.diff(times) <= 0).any():
+        return None
+    windows = np.lib.stride_tricks.sliding_window_view(times, width)
+    place = (windows - windows.mean(axis=1, keepdims=True)) / np.ptp(windows, axis=1)[:, None]
+    contrast = 1 / np.prod(place[:, :, None] - place[:, None, :] + np.eye(width), axis=2)  # the divided difference
+    return np.asarray(contrast / np.linalg.norm(contrast, axis=1, keepdims=True))

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from jeuler._core.interpolate import hermite
-from jeuler.fitting.forward import Forward
+from jeuler.fitting.forward import Forward, in_a_loop
 from jeuler.fitting.observations import place_in_steps
 from jeuler.fitting.parameters import Places
 from jeuler.fitting.unknowns import Layout
@@ -54,6 +54,10 @@ class Prediction:
     def form(self, data: dict[str, Any]) -> jax.ShapeDtypeStruct:
         """The form of the residual."""
         return jax.ShapeDtypeStruct(data["targets"].shape, data["state"].position.dtype)
+
+    def in_loops(self) -> Prediction:
+        """The same, with the stages of a Runge-Kutta step in a loop: quicker to compile."""
+        return dataclasses.replace(self, step=in_a_loop(self.step))
 
     def forward(self, layout: Layout, data: dict[str, Any]) -> Forward:
         """The same with derivatives by forward mode, in one program of its own."""

@@ -61,6 +61,7 @@ def report(
         "noise_ratio": rms / noise if noise else None,
         "autocorrelation": errors.autocorrelation,
     }
+    apart = ("the errors are not those of a minimum",) if words != "converged" and errors.stderr is not None else ()
     verdict = Verdict(
         ending=words,
         nonfinite=int(state.nonfinite),
@@ -69,7 +70,7 @@ def report(
         unresolved=errors.unresolved,
         correlated=errors.correlated,
         sigma_given=problem.absolute,
-        more=(*known.more, *_few(size, len(x)), *_kept(layout)),
+        more=(*apart, *known.more, *_few(size, len(x)), *_kept(layout)),
         **quality,
     )
     return Fit(

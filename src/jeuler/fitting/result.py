@@ -35,7 +35,8 @@ class Fit:
       undetermined: names of the parameters that the data do not determine.
       blind: the combinations of them that do not change the residual, in words.
       at_bound: names of the parameters that ended on a bound.
-      explained: share of the variance of the data that the fit explains, 1 at best; None where the data are not known.
+      explained: share of the variance of the data that the fit explains, 1 at best; None where these are not known:
+        `fit` sees them where data have the shapes of the residual, which is the model minus them.
       noise_ratio: residual over the noise of the data (from sigma, or seen in the data); None where it is not known.
       autocorrelation: of the residual from one sample to the next; near 0 where the model leaves nothing behind.
       nonfinite: how many trial points gave a value or gradient that was not finite and were stepped back from.
@@ -157,7 +158,7 @@ class Verdict:
         if explained is not None and explained < 0.9 and (poor or (ratio is not None and ratio > 1.5)):
             parts.append(
                 f"it explains only {max(explained, 0):.0%} of the variance of the data: a wrong minimum or a wrong "
-                f"model; start elsewhere, try starts=64, or change the model"
+                f"model; start elsewhere, fit the first part of the time first, try starts=64, or change the model"
             )
         elif ratio is not None and ratio > 1.5:
             noise = "sigma" if self.sigma_given else "the noise in the data"

@@ -73,13 +73,14 @@ def drawn_starts(count: int, x: np.ndarray, task: Task, evaluate: Any) -> np.nda
         reach = float(np.linalg.norm(np.asarray(r, float))) / norms
     reach = np.where(np.isfinite(reach) & (reach > 0), reach, np.where(x != 0, np.abs(x), 1.0))
     between = np.isfinite(task.lower) & np.isfinite(task.upper)
+    low, high = np.where(between, task.lower, 0), np.where(between, task.upper, 0)
     positive = (task.lower >= 0) & (x > 0) & ~between
     xs = [x]
     for _ in range(count - 1):
         uniform = draw.uniform(size=len(x))
         about = x + reach * draw.normal(size=len(x))
         about = np.where(positive, x * 10 ** (2 * uniform - 1), about)
-        about = np.where(between, task.lower + uniform * (task.upper - task.lower), about)
+        about = np.where(between, low + uniform * (high - low), about)
         xs.append(np.clip(about, task.lower, task.upper))
     return np.stack(xs)
 
