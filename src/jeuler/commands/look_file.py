@@ -8,7 +8,8 @@ import shlex
 import numpy as np
 
 from jeuler.commands import options
-from jeuler.commands.selection import OBSERVED, Measurement, recordings_in, select
+from jeuler.commands.channels import OBSERVED
+from jeuler.commands.selection import Measurement, recordings_in, select
 from jeuler.fitting.recordings.columns import Column
 from jeuler.fitting.recordings.recording import Recording
 from jeuler.fitting.recordings.table import listed

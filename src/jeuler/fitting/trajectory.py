@@ -47,7 +47,8 @@ def read_trajectory(
     Text with commas, semicolons, tabs or blanks between cells, decimal points or commas, in UTF-8, UTF-16 or Latin-1;
     title lines, names (in a comment too), a row of units; empty cells, NA, #N/A and the like are missing; dates and
     times of day become seconds. Runs side by side (each with a time column) and stacked (the clock starts again) are
-    told apart. Excel workbooks are read by pandas (``pip install 'jeuler[io]'``), MATLAB files by scipy.
+    told apart. Markers of motion capture (``.trc``), MATLAB files by scipy; Excel workbooks by pandas and xlrd, and
+    ``.c3d`` by the library c3d (``pip install 'jeuler[io]'``).
 
     Args:
       path: a path, an open file, or a pandas or polars frame. A ``.gz`` file, or a zip file of one table, is unpacked.

@@ -69,30 +69,54 @@ def _cell_number(cell: Any) -> float:
 
 
 def read_workbook(source: str, raw: bytes, skip: int = 0) -> Table:
-    """The first sheet of a workbook that holds a table, by pandas with openpyxl (.xlsx) or xlrd (.xls)."""
-    engine = "xlrd" if raw.startswith(COMPOUND) else "openpyxl"
+    """The first sheet of a workbook that holds a table, by pandas with openpyxl (.xlsx) or by xlrd (.xls)."""
+    old = raw.startswith(COMPOUND)
     try:
-        import pandas
-
-        sheets = pandas.read_excel(io.BytesIO(raw), sheet_name=None, header=None, engine=engine, dtype=object)
+        sheets = _old_sheets(raw) if old else _new_sheets(raw)
     except ImportError:
+        needed = "xlrd" if old else "pandas and openpyxl"
         raise ValueError(
-            f"{source}: an Excel workbook needs pandas and {engine}: pip install 'jeuler[io]', or save it as CSV"
+            f"{source}: an Excel workbook needs {needed}: pip install 'jeuler[io]', or save it as CSV"
         ) from None
-    except Exception as error:  # what the two readers raise for a damaged workbook is documented by neither
-        raise ValueError(f"{source}: the workbook cannot be read ({error}); save the sheet as CSV") from None
+    except Exception as error:  # what the readers raise for a damaged workbook is documented by none
+        raise ValueError(
+            f"{source}: the workbook cannot be read ({error or type(error).__name__}); save the sheet as CSV"
+        ) from None
     refusals = []
-    for name, sheet in sheets.items():
-        if sheet.shape[0] < 2 or sheet.shape[1] < 2:
-            refusals.append(f"{source}: sheet {name!r}: {sheet.shape[0]} rows of {sheet.shape[1]} columns")
+    for name, rows in sheets.items():
+        width = max(map(len, rows), default=0)
+        if len(rows) < 2 or width < 2:
+            refusals.append(f"{source}: sheet {name!r}: {len(rows)} rows of {width} columns")
             continue
-        lines = ["\t".join(_cell_text(cell) for cell in row) for row in sheet.itertuples(index=False)]
+        lines = ["\t".join(_cell_text(cell) for cell in row) for row in rows]
         note = (f"The sheet {name!r} of {len(sheets)} was read.",) if len(sheets) > 1 else ()
         try:
             return read_text(f"{source}: sheet {name!r}", "\n".join(lines), skip, note)
         except ValueError as error:
             refusals.append(str(error))
     raise ValueError(refusals[0] if refusals else f"{source}: the workbook has no sheet")
+
+
+def _new_sheets(raw: bytes) -> dict[str, list[Any]]:
+    """The cells of each sheet of an .xlsx file, row by row."""
+    import pandas
+
+    sheets = pandas.read_excel(io.BytesIO(raw), sheet_name=None, header=None, engine="openpyxl", dtype=object)
+    return {str(name): list(sheet.itertuples(index=False)) for name, sheet in sheets.items()}
+
+
+def _old_sheets(raw: bytes) -> dict[str, list[Any]]:
+    """The cells of each sheet of an .xls file, row by row; spreadsheet errors are missing values."""
+    import xlrd
+
+    book = xlrd.open_workbook(file_contents=raw, logfile=io.StringIO())
+
+    def value(cell: Any) -> Any:
+        if cell.ctype == xlrd.XL_CELL_DATE:
+            return xlrd.xldate_as_datetime(cell.value, book.datemode)
+        return None if cell.ctype == xlrd.XL_CELL_ERROR else cell.value
+
+    return {sheet.name: [[value(cell) for cell in row] for row in sheet.get_rows()] for sheet in book.sheets()}
 
 
 def _cell_text(cell: Any) -> str:

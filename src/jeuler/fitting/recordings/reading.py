@@ -7,6 +7,7 @@ from typing import Any
 from jeuler._core import checks
 from jeuler.fitting.recordings import source as sources
 from jeuler.fitting.recordings.frames import is_frame, read_frame, read_matlab, read_workbook
+from jeuler.fitting.recordings.motion_capture import is_c3d, is_trc, read_c3d, read_trc
 from jeuler.fitting.recordings.table import Table
 from jeuler.fitting.recordings.text import read_text
 
@@ -21,5 +22,9 @@ def read_table(source: Any, skip: int = 0) -> Table:
         return read_workbook(name, raw, skip)
     if isinstance(raw, bytes) and raw.startswith(b"MATLAB"):
         return read_matlab(name, raw)
+    if isinstance(raw, bytes) and is_c3d(raw):
+        return read_c3d(name, raw)
     decoded, notes = sources.text(name, raw)
+    if is_trc(decoded):
+        return read_trc(name, decoded, notes)
     return read_text(name, decoded, skip, notes)
