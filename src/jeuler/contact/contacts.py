@@ -34,6 +34,21 @@ class Contacts:
     An array with one row a contact has leading axis ``contact`` = colliders * particles + pairs.
     """
 
+    colliders: tuple[Any, ...]
+    particles: int
+    dim: int
+    t0: Array
+    dt: Array
+    restitution: Array
+    friction: Array
+    radius: Array  # (particle,), m
+    inverse_mass: Array  # (particle,), 1/kg, 0 for what cannot move
+    alive: Array  # (particle,)
+    i: Array  # (pair,), the first particle
+    j: Array
+    listed: Array  # (pair,), False in slots without a pair
+    left_out: Array  # how many pairs found no slot
+
     def __init__(self, collisions: Any, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None) -> None:
         dtype = x.dtype
         self.colliders, self.particles, self.dim = collisions.colliders, *x.shape

@@ -146,7 +146,7 @@ class Turbulence:
     frequencies: Parameter
 
     limits: ClassVar[dict[str, Any]] = {"speed": (">= 0", "m/s"), "size": ("> 0", "m"), "time": ("> 0", "s")}
-    may_be_infinite: ClassVar = ("time",)
+    may_be_infinite: ClassVar[tuple[str, ...]] = ("time",)
     axes: ClassVar[dict[str, int]] = {"speed": 0, "size": 0, "time": 0}
 
     def __post_init__(self) -> None:

@@ -149,7 +149,7 @@ def _run(chunk: Any, state: PyTree, grid: Grid, numbers: int, tell: Callable[[in
 class Sizes:
     """How many steps to do at once, from the time that steps took; known from earlier runs of the same program."""
 
-    def __init__(self, known: dict, numbers: int) -> None:
+    def __init__(self, known: dict[int, float], numbers: int) -> None:
         self.known, self.numbers = known, numbers  # seconds a step, by how many numbers there are
         self.warm = numbers in known
         self.next = max(1, int(SECONDS / known[numbers] if self.warm else FIRST / numbers))
