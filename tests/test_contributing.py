@@ -38,8 +38,15 @@ def made():
 def test_the_force_is_its_equation_and_refuses_what_it_says(made):
     pull = made["Pull"](lambda t: jnp.array([t, 0.0]), strength=2.0)
     np.testing.assert_allclose(pull(3.0, jnp.ones((1, 2)), jnp.zeros((1, 2)), jnp.ones(1)), [[4.0, -2.0]])
+    damped = made["Pull"](lambda t: jnp.array([3 * t, 0.0]), strength=0.0, damping=2.0)
+    np.testing.assert_allclose(damped(1, jnp.ones((1, 2)), jnp.ones((1, 2)), jnp.ones(1)), [[4.0, -2.0]])
     with pytest.raises(ValueError, match=r"Pull\.strength must not be negative"):
         made["Pull"]([0.0, 0.0], strength=-2.0)
+    with pytest.raises(ValueError, match=r"Pull\.strength must be one number, got shape \(2,\)"):
+        jeuler.simulate(
+            jeuler.Scene((made["Pull"]([0.0, 0.0], [1.0, 2.0]),)),
+            jeuler.ParticleState(*jnp.zeros((2, 1, 2))), dt=0.1, num_steps=1,
+        )  # fmt: skip
     with pytest.raises(ValueError, match=r"Pull\.center must have shape \(2,\)"):
         jeuler.simulate(
             jeuler.Scene((made["Pull"]([0.0], 1.0),)), jeuler.ParticleState(*jnp.zeros((2, 1, 2))), dt=0.1, num_steps=1

@@ -39,3 +39,12 @@ class Indices:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(shape={self.shape})"
+
+
+def different_particles(name: str, given: Any) -> Indices:
+    """The indices of different particles, (particle,), from a list, an array or a range."""
+    indices = Indices(list(given) if isinstance(given, range) else given, name)
+    if len(indices.shape) != 1:
+        raise ValueError(f"{name} must have shape (particle,), got {indices.shape}")
+    checks.different(name, indices.indices, "particles")
+    return indices

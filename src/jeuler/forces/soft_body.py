@@ -15,7 +15,7 @@ from jax import Array, lax
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices, default
 from jeuler._core.component import component, store_as_float
-from jeuler._core.indices import Indices
+from jeuler._core.indices import different_particles
 from jeuler._core.limits import check_limits
 
 
@@ -113,12 +113,7 @@ class ShapeMatching:
     axes: ClassVar[dict[str, int]] = {"stiffness": 0, "damping": 0}
 
     def __post_init__(self) -> None:
-        given = list(self.particles) if isinstance(self.particles, range) else self.particles
-        body = Indices(given, "ShapeMatching.particles")
-        if len(body.shape) != 1:
-            raise ValueError(f"ShapeMatching.particles must have shape (body particle,), got {body.shape}")
-        checks.different("ShapeMatching.particles", body.indices, "particles")
-        object.__setattr__(self, "particles", body)
+        object.__setattr__(self, "particles", different_particles("ShapeMatching.particles", self.particles))
         store_as_float(self, "rest_position", "stiffness", "damping")
         if self.rest_position.ndim != 2 or len(self.rest_position) != len(self.particles):
             raise ValueError(
