@@ -84,6 +84,7 @@ def _add_reading(job: argparse.ArgumentParser) -> None:
     add("--columns", help="columns to use, by name: x1,y1,x2,y2 (default: by quantity, said in the result)")
     add("--observe", choices=OBSERVED, help="the quantity to use (default: position before angle before acceleration)")
     add("--input", metavar="NAME", help="the column of a measured force; its gain is fitted")
+    add("--support", metavar="NAME", help="the column of the measured position of what the spring hangs on")
     add("--dim", type=int, help="coordinates a particle, where the names do not tell")
     add("--time", metavar="NAME", help="the time column (default: the one that is named so)")
     add("--run", metavar="N", help="which run, or all in one fit (default: the one with the most rows)")
@@ -103,6 +104,17 @@ def _add_model(job: argparse.ArgumentParser) -> None:
     add("--friction", help="viscous, quadratic, dry, several joined by +, or compare (default viscous)")
     add("--drag", choices=["quadratic"], help="the same as --friction viscous+quadratic")
     add("--cubic", action="store_true", help="add a cubic term to the spring: ks x + k3 x^3")
+    add(
+        "--drift",
+        type=int,
+        nargs="?",
+        const=1,
+        metavar="N",
+        help="the zero moves, by a polynomial of degree N (default 1)",
+    )
+    add(
+        "--delay", help="s by which channels are late: 0,0.02, one a particle; ? to be found, fit for all but the first"
+    )
     add("--pendulum", action="store_true", help="a pendulum at any angle instead of a linear spring")
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import numpy as np
 
 from jeuler.commands.estimate import Estimate
+from jeuler.commands.linear_start import without_drift
 from jeuler.commands.selection import Measurement
 from jeuler.fitting.oscillation import Oscillation
 from jeuler.fitting.recordings.table import listed
 from jeuler.fitting.spectrum import strong_lines
 
 LARGE_RESIDUAL = 0.02  # of the spread of the data
+DRIFT = 0.3  # of the residual's variance in a slow polynomial: the zero drifts
 LARGE_ANGLE = 0.35  # rad: the period of a pendulum is 0.8 % longer there
 
 
@@ -52,7 +55,8 @@ def _sampling_words(measured: Measurement, guess: Oscillation) -> Iterator[str]:
 
 def _motion_words(measured: Measurement, found: Estimate, guess: Oscillation) -> Iterator[str]:
     model, period = found.model, 2 * np.pi / guess.angular_frequency
-    flat = measured.positions.reshape(len(measured.times), -1)
+    still = without_drift(measured, 2) if _trend(measured, found)[0] > DRIFT else measured
+    flat = still.positions.reshape(len(measured.times), -1) - _drift(measured, found)
     if measured.quantity == "angle" and not model.pendulum:
         swing = float(np.nanmax(np.abs(flat - np.nanmean(flat, axis=0))))
         if swing > LARGE_ANGLE:
@@ -81,6 +85,41 @@ def _motion_words(measured: Measurement, found: Estimate, guess: Oscillation) ->
             )
 
 
+def _drift(measured: Measurement, found: Estimate) -> np.ndarray:
+    """How far the zero of each column has moved, (time, column)."""
+    if not found.model.drift:
+        return np.zeros((len(measured.times), 1))
+    still = {"drift": found.params["drift"]}
+    return np.asarray(found.model.zero(still, jnp.asarray(measured.times))).reshape(len(measured.times), -1)
+
+
+def _trend(measured: Measurement, found: Estimate) -> tuple[float, float]:
+    """The share of a residual's variance that a polynomial of second degree explains, and how far that moves.
+
+    0 where a drift is fitted, or the residual is small.
+    """
+    residual, share = _residual(measured, found)
+    if found.model.drift or share <= LARGE_RESIDUAL / 4:
+        return 0.0, 0.0
+    z = np.linspace(-1, 1, len(residual))
+    explained, moved = 0.0, 0.0
+    for column in residual.T:
+        seen = np.isfinite(column)
+        if seen.sum() < 10 or not np.var(column[seen]):
+            continue
+        slow = np.polynomial.Polynomial.fit(z[seen], column[seen], 2)(z)
+        explained = max(explained, float(1 - np.var(column[seen] - slow[seen]) / np.var(column[seen])))
+        moved = max(moved, float(np.ptp(slow)))
+    return explained, moved
+
+
+def _residual(measured: Measurement, found: Estimate) -> tuple[np.ndarray, float]:
+    """Data less model, (time, column), and its root mean square as a share of the data's spread."""
+    residual = (measured.positions - found.predicted).reshape(len(measured.times), -1)
+    spread = float(np.nanstd(measured.positions - np.nanmean(measured.positions, axis=0)))
+    return residual, float(np.sqrt(np.nanmean(residual**2))) / spread if spread else 0.0
+
+
 def _held(times: np.ndarray, flat: np.ndarray) -> float:
     """How long nothing moves at the beginning, s."""
     extent = np.nanmax(flat, axis=0) - np.nanmin(flat, axis=0)
@@ -92,10 +131,7 @@ def _held(times: np.ndarray, flat: np.ndarray) -> float:
 
 
 def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) -> Iterator[str]:
-    residual = (measured.positions - found.predicted).reshape(len(measured.times), -1)
-    spread = float(np.nanstd(measured.positions - np.nanmean(measured.positions, axis=0)))
-    rms = float(np.sqrt(np.nanmean(residual**2)))
-    share = rms / spread if spread else 0.0
+    residual, share = _residual(measured, found)
     lag = lag_one(residual)
     far = _far(residual)
     if far.size and share > LARGE_RESIDUAL / 20:
@@ -103,6 +139,13 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
             f"{far.size} rows lie far from the model, the first at {measured.times[far[0]]:.4g} s: a knock, a lost "
             f"point or a damaged cell; look at those rows, and leave them out or empty their cells."
         )
+    slow, moved = _trend(measured, found)
+    if slow > DRIFT:
+        yield (
+            f"The zero drifts by {moved:.2g} {measured.unit}, {100 * slow:.0f} % of the residual's variance: "
+            f"use --drift, or --drift 3 where it is no straight line."
+        )
+        return
     if share > 0.7:
         yield (
             f"The model explains only {max(0.0, 100 * (1 - share**2)):.0f} % of the variance: its numbers mean "

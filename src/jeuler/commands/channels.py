@@ -33,17 +33,25 @@ def resolve(name: str, available: list[str]) -> str | None:
 
 
 def input_column(recording: Recording, arguments: Any) -> Column:
-    """The column of the measured force."""
-    name = resolve(arguments.input, [c.name for c in recording.columns])
+    """The column of the measured force, or of the measured position of the support."""
+    option, given = ("--input", arguments.input) if arguments.support is None else ("--support", arguments.support)
+    name = resolve(given, [c.name for c in recording.columns])
     if name is None:
         names = listed([c.name for c in recording.columns])
-        raise ValueError(f"{recording.source}: --input {arguments.input!r} is no column; the columns are {names}")
-    return next(c for c in recording.columns if c.name == name)
+        raise ValueError(f"{recording.source}: {option} {given!r} is no column; the columns are {names}")
+    column = next(c for c in recording.columns if c.name == name)
+    if arguments.support is not None and column.quantity not in ("position", ""):
+        raise ValueError(
+            f"{recording.source}: --support {given}: is of {column.quantity}, expected a position; "
+            f"say its unit with --unit, or give the force that acts with --input"
+        )
+    return column
 
 
 def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], str, int, list[tuple[str, str]]]:
     """The columns to fit, their quantity, the coordinates per particle, and the columns left out with the reasons."""
-    drive = None if arguments.input is None else input_column(recording, arguments)
+    driven = arguments.input is not None or arguments.support is not None
+    drive = input_column(recording, arguments) if driven else None
     usable = [c for c in recording.columns if c.quantity != "text" and c != drive]
     if arguments.columns is not None:
         columns = _named_columns(recording, arguments.columns)

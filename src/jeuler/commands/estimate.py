@@ -10,8 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core.component import replace
-from jeuler.commands.linear_start import driven_start, equation_of_motion, network_start, state_start
-from jeuler.commands.model import Model, steps_to
+from jeuler.commands.linear_start import (
+    delay_start,
+    driven_start,
+    equation_of_motion,
+    network_start,
+    state_start,
+    undelayed,
+    without_drift,
+)
+from jeuler.commands.model import Model
 from jeuler.commands.selection import Measurement
 from jeuler.fitting import fit
 from jeuler.fitting.observations import horizons
@@ -70,11 +78,20 @@ class Estimate:
 
 
 def guess_of(measured: Measurement) -> Oscillation:
-    """Frequency and decay of the strongest line."""
-    try:
-        return estimate_oscillation(measured.times, measured.positions.reshape(len(measured.times), -1))
-    except ValueError as error:
-        raise ValueError(f"{measured.source}: {error}") from None
+    """Frequency and decay of the strongest line; a slower one than the record is a drift if another is there."""
+
+    def strongest(record: Measurement) -> Oscillation:
+        try:
+            return estimate_oscillation(record.times, record.positions.reshape(len(record.times), -1))
+        except ValueError as error:
+            raise ValueError(f"{record.source}: {error}") from None
+
+    cycle = 2 * np.pi / (float(np.ptp(measured.times)) or 1.0)
+    found = strongest(measured)
+    if found.angular_frequency > 1.2 * cycle:
+        return found
+    faster = strongest(without_drift(measured, 2))
+    return faster if faster.angular_frequency > 2 * cycle else found
 
 
 def step_size(measured: Measurement, guess: Oscillation, asked: float | None) -> float:
@@ -109,14 +126,21 @@ def starting_values(
     kd = np.full(springs, asked.get("kd", 2 * mean_mass * guess.decay_rate))
     mass = np.where(np.isnan(model.mass), mean_mass, model.mass)
     coupled = bool(model.pairs) and not model.places
+    start: dict[str, Any] = {}
+    if model.delay and not model.places:
+        late = delay_start(model, without_drift(measured, model.drift), guess)
+        start |= {"delay": late[np.isnan(model.delay)]} if np.isnan(model.delay).any() else {}
+        measured = undelayed(measured, late)
     if coupled and model.dim == 1 and model.observe in ("position", "angle") and not asked:
-        ks, kd, mass = network_start(model, measured, guess)
+        ks, kd, mass, _ = network_start(model, without_drift(measured, model.drift), guess)
         ks = np.maximum(ks, 1e-6 * ks.max())
-    start: dict[str, Any] = {"ks": ks, "kd": kd}
+    start |= {"ks": ks, "kd": kd}
     if model.drive is not None:
-        start |= driven_start(model, measured, guess)
+        start |= driven_start(model, without_drift(measured, model.drift), guess)[0]
     elif model.places:
         start |= _places(model, measured)
+        if np.isnan(model.delay).any():
+            start["delay"] = np.zeros(np.isnan(model.delay).sum())
     else:
         start |= state_start(model, measured, ks, kd, np.maximum(mass, 1e-9))
     if np.isnan(model.mass).any():
@@ -132,6 +156,8 @@ def starting_values(
         del start["kd"]
     if model.cubic and "cubic" not in start:
         start["cubic"] = np.asarray(0.0)
+    if model.drift and "drift" not in start:
+        start["drift"] = np.zeros((model.drift, model.particles, model.dim))
     return start, model.pendulum or model.places or model.cubic or bool(asked) or (coupled and model.dim > 1)
 
 
@@ -219,6 +245,8 @@ def _scales(model: Model, measured: Measurement, guess: Oscillation, start: dict
         "position": amplitude,
         "velocity": amplitude * omega,
         "offset": spread,
+        "drift": spread,
+        "delay": 0.1 / omega,
         "anchors": amplitude,
         "rest_length": amplitude,
         "mass": 0.3 * float(np.nanmean(model.mass)),
@@ -226,7 +254,9 @@ def _scales(model: Model, measured: Measurement, guess: Oscillation, start: dict
         "quadratic": 0.1 * ks / omega / (amplitude * omega),
         "dry": 0.1 * ks * amplitude,
         "cubic": 0.3 * ks / amplitude**2,
-        "gain": max(ks * amplitude / (float(np.std(model.drive[0])) or 1.0), 1e-300) if model.drive else 1.0,
+        "gain": max(ks * amplitude / (float(np.std(measured.drive)) or 1.0), 1e-300)
+        if measured.drive is not None
+        else 1.0,
     }
 
 
@@ -242,17 +272,17 @@ def _descend(
 ) -> tuple[Any, Any]:
     seen = np.nonzero(np.isfinite(measured.positions))
     targets = jnp.asarray(measured.positions[seen])
-    t0, count = float(measured.times[0]), steps_to(measured, dt)
+    begin, _ = model.grid(measured.times, dt)
 
     def predict(params: dict[str, Any]) -> jax.Array:
         free = {k: jnp.where(jnp.asarray(held[k]), 0.0, v) if k in held else v for k, v in params.items()}
-        return model.predict(free, measured.times, dt, t0, count)
+        return model.predict(free, measured.times, dt)
 
     found = fit(
         lambda params: predict(params)[seen] - targets,
         {name: jnp.asarray(value, float) for name, value in start.items()},
         scale={name: scale[name] for name in start},
-        stages=horizons(measured.times[seen[0]] - t0) if grow else (),
+        stages=horizons(measured.times[seen[0]] - begin) if grow else (),
         max_iterations=max_iterations,
         tolerance=1e-7,
         progress=False,

@@ -17,7 +17,7 @@ from jeuler._core.files import check_output, write_text
 from jeuler.commands import options
 from jeuler.commands.cautions import cautions
 from jeuler.commands.estimate import Estimate, estimate, guess_of, step_size
-from jeuler.commands.linear_start import band_limited
+from jeuler.commands.linear_start import band_limited, without_drift
 from jeuler.commands.model import Model
 from jeuler.commands.page import page
 from jeuler.commands.picture import draw
@@ -28,6 +28,8 @@ from jeuler.fitting.oscillation import Oscillation
 DEFAULT_PICTURE = "jeuler_fit.png"
 PICTURES = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".eps", ".ps")
 STANDARD_OUTPUT = "-"
+MOST_DRIFT = 6
+NEED_A_FILE = ("columns", "observe", "input", "support", "dim", "time", "run", "unit", "skip", "begin", "end")
 
 
 def fit_file(arguments: argparse.Namespace, started: float) -> None:
@@ -40,8 +42,10 @@ def fit_file(arguments: argparse.Namespace, started: float) -> None:
     options.check_number("--dt", arguments.dt, positive=True)
     if arguments.max_iterations < 1:
         raise ValueError(f"--max-iterations must be 1 or more, got {arguments.max_iterations}")
+    if arguments.drift is not None and not 1 <= arguments.drift <= MOST_DRIFT:
+        raise ValueError(f"--drift must be a degree from 1 to {MOST_DRIFT}, got {arguments.drift}")
     measured = _measured(arguments)
-    guess = guess_of(measured)
+    guess = guess_of(without_drift(measured, arguments.drift or 0))
     mass = options.masses(
         arguments.mass if arguments.files else str(options.EXAMPLE["mass"]), measured.positions.shape[1]
     )
@@ -58,6 +62,10 @@ def fit_file(arguments: argparse.Namespace, started: float) -> None:
 def _measured(arguments: argparse.Namespace) -> Measurement:
     """The built-in example, one recording, or several of one spring."""
     if not arguments.files:
+        given = [name for name in NEED_A_FILE if getattr(arguments, name) is not None]
+        if given:
+            option = {"begin": "from", "end": "to"}.get(given[0], given[0])
+            raise ValueError(f"--{option} has no meaning without a FILE: the built-in example is fitted then")
         return options.example()
     if len({os.path.realpath(file) for file in arguments.files}) < len(arguments.files):
         raise ValueError(
@@ -92,7 +100,12 @@ def _model(arguments: argparse.Namespace, measured: Measurement, mass: np.ndarra
             f"--pendulum fits one angle, got {particles} particles of {dim} coordinates; choose with --columns"
         )
     if (arguments.cubic or measured.drive is not None) and (particles > 1 or dim > 1 or arguments.pendulum):
-        raise ValueError("--cubic and --input fit one particle along one coordinate on a spring; choose with --columns")
+        raise ValueError(
+            "--cubic, --input and --support fit one particle along one coordinate on a spring; choose with --columns"
+        )
+    delay = _delay(arguments, measured, pairs)
+    unknown = bool(np.isnan(delay).any()) and measured.drive is None
+    period = 2 * np.pi / guess.angular_frequency
     speed = float(np.nanstd(measured.positions)) * guess.angular_frequency * np.sqrt(2)
     speed = {"acceleration": speed / guess.angular_frequency**2}.get(
         measured.quantity, speed / guess.angular_frequency if "velocity" in measured.quantity else speed
@@ -106,11 +119,34 @@ def _model(arguments: argparse.Namespace, measured: Measurement, mass: np.ndarra
         observe=measured.quantity,
         pendulum=arguments.pendulum,
         cubic=arguments.cubic,
-        drive=None if measured.drive is None else band_limited(measured.times, measured.drive),
+        drive=_band_limited_drive(measured),
+        moves_support=measured.moves_support,
+        delay=delay,
+        reach=float(np.nanmax(np.abs([0.0, *delay]))) + 0.75 * period * unknown if measured.drive is None else 0.0,
+        drift=arguments.drift or 0,
+        span=(float(measured.times[0]), float(measured.times[-1])),
         shared=shared,
         spring_mass=shared and len(set(mass.tolist())) > 1,
         slow=0.02 * speed,
     )
+
+
+def _delay(arguments: argparse.Namespace, measured: Measurement, pairs: list[tuple[int, int]]) -> tuple[float, ...]:
+    """The delays that are asked for, refused where a delay changes nothing but a phase that is free anyway."""
+    particles = measured.positions.shape[1]
+    if arguments.delay is not None and measured.drive is None and not pairs:
+        raise ValueError(
+            "--delay: a particle on a spring of its own may start at any phase, so that a delay cannot be told "
+            "from it; it shows between particles that springs join (--edges 1-anchor,1-2) and with --input or --support"
+        )
+    return options.delays(arguments.delay, particles, measured.drive is not None)
+
+
+def _band_limited_drive(measured: Measurement) -> tuple[np.ndarray, float, float] | None:
+    """The measured input on a finer clock; the position of a support about its mean."""
+    if measured.drive is None:
+        return None
+    return band_limited(measured.times, measured.drive - (measured.drive.mean() if measured.moves_support else 0.0))
 
 
 def _fit(

@@ -103,6 +103,7 @@ def suggested(arguments: argparse.Namespace, measured: Measurement, recordings: 
         ("--columns", "columns"),
         ("--observe", "observe"),
         ("--input", "input"),
+        ("--support", "support"),
         ("--dim", "dim"),
         ("--time", "time"),
         ("--run", "run"),

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jeuler._core.interpolate import hermite
-from jeuler.commands.forces import Driving, DryFriction, Restoring, SignedQuadraticDrag
-from jeuler.commands.selection import Measurement
+from jeuler.commands.forces import Driving, DryFriction, Restoring, Samples, SignedQuadraticDrag
 from jeuler.fitting.observations import place_in_steps
 from jeuler.forces import Springs
 from jeuler.particles._simulate import simulate
@@ -36,6 +36,11 @@ class Model:
       spring_mass: the spring's own effective mass is fitted.
       slow: the speed below which dry friction is smoothed.
       drive: samples of a measured force, (sample,), the time of the first, and the step between them; None without.
+      moves_support: whether drive is the position of the support, about its mean, and no force.
+      delay: (particle,), s by which each channel is late, NaN where it is fitted; with a drive, by which the motion is
+        late against it; () without.
+      reach: s, how far before the first time the run begins, so that late channels have their past.
+      drift: the degree of the polynomial by which the zero moves.  span: first and last time, s.
     Positions are displacements from rest, so that springs keep their sign through zero; only where particles in a plane
     or in space are joined in pairs are they places; rest lengths and anchors are then fitted too (`places`).
     """
@@ -52,6 +57,11 @@ class Model:
     spring_mass: bool = False
     slow: float = 1.0
     drive: tuple[np.ndarray, float, float] | None = None
+    moves_support: bool = False
+    delay: tuple[float, ...] = ()
+    reach: float = 0.0
+    drift: int = 0
+    span: tuple[float, float] = (0.0, 1.0)
 
     @property
     def particles(self) -> int:
@@ -77,6 +87,24 @@ class Model:
             mass = mass.at[np.flatnonzero(np.isnan(self.mass))].set(params["mass"])
         return mass + params["spring_mass"] if "spring_mass" in params else mass
 
+    def delays(self, params: dict[str, Any]) -> Any:
+        """The delay of each particle's channel, s, with the fitted values in place of NaN."""
+        delay = jnp.asarray(self.delay)
+        return delay.at[np.flatnonzero(np.isnan(self.delay))].set(params["delay"]) if "delay" in params else delay
+
+    def zero(self, params: dict[str, Any], t: Array) -> Any:
+        """What is read where nothing has moved: the offset and its drift, sum_k drift_k z^k with z from -1 to 1."""
+        if not self.drift:
+            return params.get("offset", 0.0)
+        z = (2 * t - self.span[0] - self.span[1]) / (self.span[1] - self.span[0])
+        powers = z[:, None] ** np.arange(1, self.drift + 1)
+        return params.get("offset", 0.0) + jnp.einsum("td,dpa->tpa", powers, params["drift"])
+
+    def grid(self, times: np.ndarray, dt: float) -> tuple[float, int]:
+        """The time at which the run begins, and the number of steps that reach the last time."""
+        begin = float(times[0]) - self.reach
+        return begin, max(1, int(np.ceil((float(times[-1]) + self.reach - begin) / dt * (1 - 1e-12))))
+
     def scene(self, params: dict[str, Any]) -> tuple[Scene, ParticleState]:
         """Forces and initial state."""
         n, anchors = self.particles, len(self.anchored) if self.pairs else 0
@@ -84,7 +112,8 @@ class Model:
         kd = jnp.asarray(params.get("kd", 0.0)) + jnp.zeros_like(ks)
         forces: list[Any] = []
         if not self.pairs:
-            forces.append(Restoring(ks[:, None], kd[:, None], params.get("cubic"), self.pendulum))
+            support = self._samples(params) if self.moves_support else None
+            forces.append(Restoring(ks[:, None], kd[:, None], params.get("cubic"), support, self.pendulum))
         else:
             if anchors:
                 edges = [(k, n + index) for index, k in enumerate(self.anchored)]
@@ -94,9 +123,8 @@ class Model:
             forces.append(SignedQuadraticDrag(params["quadratic"]))
         if "dry" in params:
             forces.append(DryFriction(params["dry"], jnp.asarray(self.slow)))
-        if self.drive is not None:
-            samples, begin, step = self.drive
-            forces.append(Driving(params["gain"], jnp.asarray(samples), jnp.asarray(begin), jnp.asarray(step)))
+        if self.drive is not None and not self.moves_support:
+            forces.append(Driving(params["gain"], self._samples(params)))
         ends = params.get("anchors", jnp.zeros((anchors, self.dim)))
         state = ParticleState(
             jnp.concatenate([params["position"], ends]),
@@ -104,6 +132,12 @@ class Model:
             jnp.concatenate([self.masses(params), jnp.full(anchors, jnp.inf)]),
         )
         return Scene(forces=tuple(forces)), state
+
+    def _samples(self, params: dict[str, Any]) -> Samples:
+        assert self.drive is not None
+        values, begin, step = self.drive
+        late = self.delays(params)[0] if self.delay else 0.0
+        return Samples(jnp.asarray(values), jnp.asarray(begin) + late, jnp.asarray(step))
 
     def motion(self, params: dict[str, Any], dt: float, num_steps: int, t0: float) -> tuple[Array, Array, Array, Scene]:
         """Positions and velocities at the steps, the masses, and the scene."""
@@ -122,33 +156,44 @@ class Model:
     def observed(self, params: dict[str, Any], scene: Scene, mass: Array, t: Array, p: Array, v: Array) -> Array:
         """What is observed at states (time, particle, dim) at times (time,)."""
         n = self.particles
-        offset = params.get("offset", 0.0)
+        zero = self.zero(params, t)
         if self.observe in ("position", "angle"):
-            return p[:, :n] + offset
+            return p[:, :n] + zero
         if self.observe in ("velocity", "angular velocity"):
-            return v[:, :n] + offset
-        import jax
-
+            return v[:, :n] + zero
         acceleration = jax.vmap(lambda t, p, v: scene.without_effects().vector_field(t, (p, v), mass)[1])(t, p, v)
-        return acceleration[:, :n] + offset
+        return acceleration[:, :n] + zero
 
-    def predict(self, params: dict[str, Any], times: np.ndarray, dt: float, t0: float, num_steps: int) -> Array:
+    def predict(self, params: dict[str, Any], times: np.ndarray, dt: float) -> Array:
         """What is observed at the times, (time, particle, dim): between steps by cubic Hermite interpolation."""
-        p, v, mass, scene = self.motion(params, dt, num_steps, t0)
-        interval, s = place_in_steps(times, t0, dt, num_steps)
-        fraction, width = jnp.asarray(s)[:, None, None], jnp.asarray(dt)
-        import jax
+        t0, num_steps = self.grid(times, dt)
+        motion = self.motion(params, dt, num_steps, t0)
+        if not self.delay or self.drive is not None:
+            return self._between(params, motion, times, place_in_steps(times, t0, dt, num_steps), t0, dt)
+        channels = []
+        for k, late in enumerate(self.delays(params)):
+            steps = (times - late - t0) / dt
+            interval = jnp.clip(jnp.floor(steps).astype(int), 0, num_steps - 1)
+            at = self._between(params, motion, times, (interval, steps - interval), t0, dt)
+            channels.append(at[:, k])
+        return jnp.stack(channels, axis=1)
 
-        a = jax.vmap(lambda p, v, t: scene.without_effects().vector_field(t, (p, v), mass)[1])
-        at = t0 + dt * jnp.arange(num_steps + 1)
+    def _between(
+        self,
+        params: dict[str, Any],
+        motion: tuple[Array, Array, Array, Scene],
+        times: np.ndarray,
+        place: tuple[Any, Any],
+        t0: float,
+        dt: float,
+    ) -> Array:
+        p, v, mass, scene = motion
+        interval, s = place
+        fraction, width = jnp.asarray(s)[:, None, None], jnp.asarray(dt)
         position = hermite(fraction, width, p[interval], p[interval + 1], v[interval], v[interval + 1])
         if self.observe in ("position", "angle"):
-            return position[:, : self.particles] + params.get("offset", 0.0)
-        slope = a(p, v, at)
+            return position[:, : self.particles] + self.zero(params, jnp.asarray(times))
+        a = jax.vmap(lambda p, v, t: scene.without_effects().vector_field(t, (p, v), mass)[1])
+        slope = a(p, v, t0 + dt * jnp.arange(len(p)))
         velocity = hermite(fraction, width, v[interval], v[interval + 1], slope[interval], slope[interval + 1])
         return self.observed(params, scene, mass, jnp.asarray(times), position, velocity)
-
-
-def steps_to(measured: Measurement, dt: float) -> int:
-    """The number of steps that reach the last time."""
-    return max(1, int(np.ceil(np.ptp(measured.times) / dt * (1 - 1e-12))))

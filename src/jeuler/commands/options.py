@@ -111,6 +111,27 @@ def frictions(text: str | None) -> tuple[str, ...]:
     return tuple(kind for kind in FRICTIONS if kind in kinds)
 
 
+def delays(text: str | None, particles: int, driven: bool) -> tuple[float, ...]:
+    """By how much each channel, or a driven motion, is late, s; NaN where it is to be found."""
+    if text is None:
+        return ()
+    if text.strip() == "fit":
+        return (math.nan,) if driven else (0.0, *[math.nan] * (particles - 1))
+    parts = [part.strip() for part in text.split(",")]
+    known = [part for part in parts if part != "?"]
+    values = iter(_floats("--delay", ",".join(known)) if known else [])
+    late = tuple(math.nan if part == "?" else next(values) for part in parts)
+    if len(late) != particles or any(abs(value) > 1e6 for value in late):
+        raise ValueError(
+            f"--delay must be fit, or {particles} numbers of s, one a particle (? for one to be found), got {text!r}"
+        )
+    if not known and not driven:
+        raise ValueError(
+            f"--delay {text}: one delay must be known, as only differences show: --delay {','.join(['0', *parts[1:]])}"
+        )
+    return late
+
+
 def check_number(option: str, value: float | None, positive: bool = False) -> None:
     """One ValueError if an option is not a finite number, or not above 0 where it must be."""
     if value is not None and (not math.isfinite(value) or (positive and value <= 0)):

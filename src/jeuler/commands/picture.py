@@ -11,7 +11,6 @@ import numpy as np
 
 from jeuler._core.files import write_atomically
 from jeuler.commands.estimate import Estimate
-from jeuler.commands.model import steps_to
 from jeuler.commands.selection import Measurement
 
 MOST_POINTS = 4000
@@ -47,9 +46,9 @@ def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str,
 
 def _curve(measured: Measurement, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
     """The model at its own steps."""
-    steps, t0 = steps_to(measured, found.dt), float(measured.times[0])
-    thin = max(1, steps // (2 * MOST_POINTS))
     model = found.model
+    t0, steps = model.grid(measured.times, found.dt)
+    thin = max(1, steps // (2 * MOST_POINTS))
 
     @jax.jit
     def values(params: dict[str, Any]) -> tuple[jax.Array, jax.Array]:

@@ -95,6 +95,13 @@ def _extras(found: Estimate) -> dict[str, Any]:
         extras["rest_position"] = found.params["offset"].tolist()
     else:
         extras["offset"] = found.params["offset"].tolist()
+    if found.model.delay:
+        extras["delay"] = np.asarray(found.model.delays(found.params)).tolist()
+        errors = iter(np.atleast_1d(found.stderr.get("delay", [])))
+        extras["delay_stderr"] = [_plain(next(errors)) if np.isnan(late) else None for late in found.model.delay]
+    if found.model.drift:
+        extras["drift"] = found.params["drift"].tolist()
+        extras["drift_stderr"] = [[list(map(_plain, row)) for row in rows] for rows in found.stderr["drift"]]
     if found.model.pendulum:
         extras["pendulum_length"] = G / float(np.atleast_1d(found.params["ks"])[0]) * float(found.mass[0])
     return extras
@@ -112,7 +119,11 @@ def equation(measured: Measurement, found: Estimate) -> str:
         return ""
     rest = float(np.ravel(params["offset"])[0]) if model.observe in ("position", "angle") and model.dim == 1 else 0.0
     letter = "angle" if model.pendulum or model.observe.startswith("ang") else "x"
-    place = f"({letter} - {rest:.4g})".replace("- -", "+ ") if rest else letter
+    velocity, moving = f"{letter}'", " - drift(t)" if model.drift else ""
+    if model.moves_support:
+        rest -= float(np.mean(measured.drive if measured.drive is not None else 0.0))
+        moving, velocity = moving + f" - s({_late(found)})", f"({letter}' - s'({_late(found)}))"
+    place = f"({letter} - {rest:.4g}{moving})".replace("- -", "+ ") if rest or moving else letter
     ks = float(np.atleast_1d(params["ks"])[0])
     mass = f"{found.mass[0]:.4g}" if not model.shared else "m"
     parts = [
@@ -121,14 +132,20 @@ def equation(measured: Measurement, found: Estimate) -> str:
     if "cubic" in params:
         parts.append(f"- {float(params['cubic']):.4g} {place}^3")
     if "kd" in params:
-        parts.append(f"- {float(np.atleast_1d(params['kd'])[0]):.4g} {letter}'")
+        parts.append(f"- {float(np.atleast_1d(params['kd'])[0]):.4g} {velocity}")
     if "quadratic" in params:
         parts.append(f"- {float(params['quadratic']):.4g} |{letter}'| {letter}'")
     if "dry" in params:
         parts.append(f"- {float(params['dry']):.4g} sign({letter}')")
     if "gain" in params:
-        parts.append(f"+ {float(params['gain']):.4g} u(t)")
+        parts.append(f"+ {float(params['gain']):.4g} u({_late(found)})")
     return " ".join(parts).replace("- -", "+ ")
+
+
+def _late(found: Estimate) -> str:
+    """The time at which a driven motion sees its input."""
+    late = float(found.model.delays(found.params)[0]) if found.model.delay else 0.0
+    return f"t - {late:.4g}".replace("- -", "+ ") if late else "t"
 
 
 Fact = tuple[str, str]  # its name, and its value in words
@@ -180,6 +197,10 @@ def fitted_numbers(result: dict[str, Any]) -> list[tuple[str, float, float | Non
     ):
         if key in result:
             numbers.append((name, result[key], result[key + "_stderr"], units[key]))
+    fitted = [k for k, error in enumerate(result.get("delay_stderr", [])) if error is not None]
+    for k in fitted:
+        name = "delay" if len(result["delay"]) == 1 else f"delay of particle {k + 1}"
+        numbers.append((name, result["delay"][k], result["delay_stderr"][k], "s"))
     return numbers
 
 
@@ -196,6 +217,7 @@ def derived(result: dict[str, Any]) -> list[Fact]:
     if result["equation"]:
         facts.append(("equation", result["equation"]))
     unit = result["unit"]
+    facts += _drift_facts(result)
     share = f"{100 * result['share_of_amplitude']:.2g} % of the amplitude {result['amplitude']:.3g} {unit}"
     facts.append(("residual RMS", f"{result['rms']:.3g} {unit}, {share}"))
     if result["stderr_widened_by"] > 1.05:
@@ -203,6 +225,23 @@ def derived(result: dict[str, Any]) -> list[Fact]:
     facts.append(("trust", _trust(result)))
     facts.append(("fit", f"{result['message']}, {result['iterations']} iterations"))
     return facts
+
+
+def _drift_facts(result: dict[str, Any]) -> list[Fact]:
+    """How the zero of each channel moves over the record."""
+    if "drift" not in result:
+        return []
+    coefficients = np.asarray(result["drift"]).reshape(len(result["drift"]), -1)
+    powers = np.linspace(-1, 1, 201)[:, None] ** np.arange(1, len(coefficients) + 1)
+    moves = powers @ coefficients
+    return [
+        (
+            f"drift of {name[:15]}",
+            f"{moved[-1] - moved[0]:.3g} {result['unit']} from the first to the last row"
+            + (f", {np.ptp(moved):.3g} at most" if len(coefficients) > 1 else ""),
+        )
+        for name, moved in zip(result["columns"], moves.T, strict=True)
+    ]
 
 
 def compared(result: dict[str, Any]) -> list[Fact]:

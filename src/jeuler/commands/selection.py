@@ -33,7 +33,8 @@ class Measurement:
       names: (particle * dim,).  quantity, unit: of the values.  left_out: (name, reason) of the other columns.
       notes: what was done, as sentences.  warnings: what may be wrong, as sentences with what to do.
       sampling: the clock before thinning.  recordings: how many of them are fitted together, one a particle.
-      drive: a measured force at the times, (time,), with --input.
+      drive: a measured force at the times, (time,), with --input; the support's position, with --support.
+      moves_support: whether drive is the latter.
     """
 
     source: str
@@ -50,6 +51,7 @@ class Measurement:
     sampling: Sampling | None = None
     recordings: int = 1
     drive: np.ndarray | None = None
+    moves_support: bool = False
 
 
 def recordings_in(source: Any, arguments: Any) -> list[Recording]:
@@ -117,12 +119,10 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
         )
     unit = columns[0].unit if unknown else UNITS[quantity]
     warnings += _size_words(columns, quantity, values)
-    drive = None
-    if arguments.input is not None:
-        drive = recording.values[:, recording.columns.index(input_column(recording, arguments))][keep]
-        _check_drive(recording.source, arguments.input, times[keep], drive)
+    drive = _drive(recording, arguments, columns, keep)
     measured = Measurement(
         drive=drive,
+        moves_support=arguments.support is not None,
         source=recording.source,
         run=recording.run,
         clock=recording.clock.name,
@@ -136,7 +136,11 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
         warnings=(*recording.warnings, *warnings),
     )
     clock = sampling(measured.times)
-    driven = (f"{arguments.input} is the measured force u(t).",) if drive is not None else ()
+    driven: tuple[str, ...] = ()
+    if drive is not None:
+        driven = (f"{arguments.input} is the measured force u(t).",)
+        if arguments.support is not None:
+            driven = (f"{arguments.support} is the measured position s(t) of the support.",)
     gaps = (f"The record has {clock.gaps} gaps, the longest of {clock.longest_gap:.3g} s.",) if clock.gaps else ()
     return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *driven, *gaps)))
 
@@ -214,11 +218,27 @@ def together(measured: list[Measurement]) -> Measurement:
     )
 
 
-def _check_drive(source: str, name: str, times: np.ndarray, drive: np.ndarray) -> None:
+def _drive(recording: Recording, arguments: Any, columns: list[Column], keep: np.ndarray) -> np.ndarray | None:
+    """The measured force or position of the support, checked; None without."""
+    if arguments.input is None and arguments.support is None:
+        return None
+    if arguments.input is not None and arguments.support is not None:
+        raise ValueError("--input and --support cannot both be given; a fit has one measured input")
+    column = input_column(recording, arguments)
+    about = f"{recording.source}: {'--input' if arguments.support is None else '--support'} {column.name}"
+    drive = recording.values[:, recording.columns.index(column)][keep]
     if not np.isfinite(drive).all():
         raise ValueError(
-            f"{source}: --input {name}: {np.isnan(drive).sum()} values are missing; the force must have none missing"
+            f"{about}: {np.isnan(drive).sum()} values are missing; a measured input must have none missing"
         )
-    clock = sampling(times)
+    if not np.ptp(drive):
+        raise ValueError(f"{about}: all values are {drive[0]:g}; leave the option out where nothing drives the motion")
+    clock = sampling(recording.times[keep])
     if clock.gaps or clock.repeated or clock.jitter > 0.02:
-        raise ValueError(f"{source}: --input {name}: its clock must be even to be interpolated: {clock.words()}")
+        raise ValueError(f"{about}: its clock must be even to be interpolated: {clock.words()}")
+    if arguments.support is not None and np.isnan(column.factor) != np.isnan(columns[0].factor):
+        raise ValueError(
+            f"{about}: is in {column.si or 'an unknown unit'} and {columns[0].name} in {columns[0].si}; "
+            f"both must have one unit: say it with --unit"
+        )
+    return drive
