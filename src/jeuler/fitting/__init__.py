@@ -1,5 +1,6 @@
 """Fitting: parameters of a simulation from what was measured, by gradient."""
 
+from jeuler.fitting._find_springs import FoundSprings, find_springs
 from jeuler.fitting._fit import fit
 from jeuler.fitting._identifiability import Identifiability, identifiability
 from jeuler.fitting._springs import SpringFit, fit_springs
@@ -8,9 +9,11 @@ from jeuler.fitting.trajectory import Trajectory, read_trajectory
 
 __all__ = [
     "Fit",
+    "FoundSprings",
     "Identifiability",
     "SpringFit",
     "Trajectory",
+    "find_springs",
     "fit",
     "fit_springs",
     "identifiability",

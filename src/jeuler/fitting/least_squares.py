@@ -223,8 +223,8 @@ def _next_trial(state: State, task: Task, taken: Any, lost: Any, at_trial: Any) 
     eps = task.precision
     size = xp.linalg.norm(state.scale * state.x)
     no_step = xp.linalg.norm(state.scale * (trial - state.x)) <= 4 * eps * size
-    # what is left to gain is below the rounding of the residuals themselves
-    flat = (newton <= (1e3 * eps * size) ** 2) | (newton <= 4 * eps * state.cost)
+    # what is left to gain is below the rounding of the residuals r, or of their squares, 2 |r| times that
+    flat = (newton <= (1e3 * eps * size) ** 2) | (newton <= 4 * eps * (state.cost + size * xp.sqrt(state.cost)))
     ended = xp.where(no_step | (state.growth > 1e12), STALLED, RUNNING)
     ended = xp.where((no_step | ~taken) & flat, ROUNDED, ended)
     ended = xp.where((offset <= task.tolerance) | (state.cost <= task.enough), CONVERGED, ended)

@@ -1,0 +1,1 @@
+"""Which particles are joined by springs: from tracks alone."""
