@@ -57,4 +57,4 @@ def test_a_damaged_value_is_warned_of(folder, capsys):
     lines[-1] = lines[-1][:11]  # cut inside a number
     (folder / "d.csv").write_text("\n".join(lines))
     assert main(["fit", "d.csv", "--mass", "0.25"]) == 0
-    assert "1 rows lie far from the model, the first at 9.96 s" in capsys.readouterr().out
+    assert "1 row far from the model, the first at 9.96 s" in capsys.readouterr().out

@@ -104,7 +104,7 @@ def test_numbers_too_large_for_their_unit_are_a_warning(folder):
         "t,y,theta\n" + quirks.table(quirks.T, quirks.acceleration(), 900 * quirks.swing())
     )
     (warning,) = selected("bare.csv", "--columns", "y").warnings
-    assert "y has no unit and an extent of" in warning
+    assert "y: no unit, and an extent of" in warning
     assert "give --unit, such as --unit y=m/s^2" in warning
     assert selected("bare.csv", "--columns", "y", "--unit", "y=m/s^2").quantity == "acceleration"
     (warning,) = selected("bare.csv", "--columns", "theta").warnings

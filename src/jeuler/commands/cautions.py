@@ -11,7 +11,7 @@ from jeuler.commands.estimate import Estimate
 from jeuler.commands.linear_start import without_drift
 from jeuler.commands.selection import Measurement
 from jeuler.fitting.oscillation import Oscillation
-from jeuler.fitting.recordings.table import listed
+from jeuler.fitting.recordings.table import counted, listed
 from jeuler.fitting.spectrum import strong_lines
 
 LARGE_RESIDUAL = 0.02  # of the spread of the data
@@ -136,8 +136,8 @@ def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) 
     far = _far(residual)
     if far.size and share > LARGE_RESIDUAL / 20:
         yield (
-            f"{far.size} rows lie far from the model, the first at {measured.times[far[0]]:.4g} s: a knock, a lost "
-            f"point or a damaged cell; look at those rows, and leave them out or empty their cells."
+            f"{counted(far.size, 'row')} far from the model, the first at {measured.times[far[0]]:.4g} s: a knock, "
+            f"a lost point or a damaged cell; look at those rows, and leave them out or empty their cells."
         )
     slow, moved = _trend(measured, found)
     if slow > DRIFT:

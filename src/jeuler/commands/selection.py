@@ -13,7 +13,7 @@ from jeuler.fitting.recordings.clock import Sampling, sampling
 from jeuler.fitting.recordings.columns import Column
 from jeuler.fitting.recordings.reading import read_table
 from jeuler.fitting.recordings.recording import Recording, longest, understand
-from jeuler.fitting.recordings.table import listed
+from jeuler.fitting.recordings.table import counted, listed
 from jeuler.fitting.spectrum import block_means, strong_lines
 from jeuler.fitting.trajectory import chosen_run
 
@@ -141,7 +141,11 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
         driven = (f"{arguments.input} is the measured force u(t).",)
         if arguments.support is not None:
             driven = (f"{arguments.support} is the measured position s(t) of the support.",)
-    gaps = (f"The record has {clock.gaps} gaps, the longest of {clock.longest_gap:.3g} s.",) if clock.gaps else ()
+    gaps = (
+        (f"The record has {counted(clock.gaps, 'gap')}, the longest of {clock.longest_gap:.3g} s.",)
+        if clock.gaps
+        else ()
+    )
     return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *driven, *gaps)))
 
 
@@ -154,7 +158,7 @@ def _size_words(columns: list[Column], quantity: str, values: np.ndarray) -> lis
     others = "another unit or an acceleration" if quantity == "position" else "degrees"
     name = columns[0].name
     return [
-        f"{listed([c.name for c in columns])} has no unit and an extent of {extent:.3g}: taken to be in "
+        f"{listed([c.name for c in columns])}: no unit, and an extent of {extent:.3g}: taken to be in "
         f"{UNITS[quantity]}. "
         f"If it is {others}, give --unit, such as --unit {name}={'m/s^2' if quantity == 'position' else 'deg'}."
     ]

@@ -41,6 +41,14 @@ LAYOUTS = {
     "exponents": "t,x\n" + rows(form="{:.9E}"),
     "quoted cells": '"t","x"\n' + "".join(f'"{a}","{b}"\n' for a, b in zip(T, X, strict=True)),
     "a line break in a name": '"t\n",x\n' + rows(),
+    "a title of as many words as names": "My swing\n\nt  x\n" + rows("  "),
+    "labels before the numbers": "".join(f"t:{a:.5f},x:{b}\n" for a, b in zip(T, X, strict=True)),
+    "a line of JSON a row": "".join(f'{{"t": {a:.5f}, "x": {b}}}\n' for a, b in zip(T, X, strict=True)),
+    "stamps of a serial monitor": "16:38:00.001 -> t,x\n"
+    + "".join(f"16:38:00.{k:03d} -> {a:.5f},{b}\n" for k, (a, b) in enumerate(zip(T, X, strict=True))),
+    "a header that says where it ends": "LabVIEW\t\n***End_of_Header***\t\nX_Dimension\tTime\t\n***End_of_Header***\t\nt\tx\tComment\n"
+    + rows("\t"),
+    "numbers above the names": "Version,1.2,Rate,25\n,,Marker\n12,34\nt,x\n" + rows(),
     "the time last": "x,t\n" + "".join(f"{b},{a:.5f}\n" for a, b in zip(T, X, strict=True)),
 }
 
@@ -71,6 +79,8 @@ def test_missing_cells(cell, separator):
         "17.05.2024 16:38:{:06.3f}",
         "5/17/2024 4:38:{:06.3f} PM",
         "16:38:{:06.3f}",
+        "38:{:06.3f}",
+        "17-May-2024 16:38:{:06.3f}",
     ],
 )
 def test_dates_and_times_of_day(stamp):
@@ -223,3 +233,35 @@ def test_hundred_thousand_rows_are_quick(random):
     started = time.process_time()
     assert len(jeuler.read_trajectory(source).times) == 100_000
     assert time.process_time() - started < 1.0  # 0.2 s on a quiet machine
+
+
+@pytest.mark.parametrize(
+    ("cells", "values"),
+    [
+        (["1,000.5", "999.25", "-12,345.5"], [1000.5, 999.25, -12345.5]),
+        (["1.000,5", "999,25", "-12.345,5"], [1000.5, 999.25, -12345.5]),
+    ],
+)
+def test_thousands_are_grouped_where_the_decimal_point_tells(cells, values):
+    text = "t;x\n" + "".join(f"{k};{cell}\n" for k, cell in enumerate(cells))
+    np.testing.assert_allclose(jeuler.read_trajectory(io.StringIO(text)).columns["x"], values)
+
+
+def test_a_date_with_blanks_between_tabs_and_missing_cells():
+    cells = [(f"{a:06.3f}", "#N/A" if k % 3 else str(b)) for k, (a, b) in enumerate(zip(T, X, strict=True))]
+    text = "when\tx\n" + "".join(f"17/05/2024 16:38:{a}\t{b}\n" for a, b in cells)
+    times, columns = jeuler.read_trajectory(io.StringIO(text))
+    np.testing.assert_allclose(times, T, atol=1e-9)
+    np.testing.assert_array_equal(columns["x"][::3], X[::3])
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [("Accelerometer.csv", "acceleration"), ("Gyroscope.csv", "angular velocity"), ("swing.csv", "position")],
+)
+def test_a_file_for_each_sensor_says_by_its_name_what_x_y_z_are(tmp_path, name, quantity):
+    rows = "".join(f"{a},1,{b},2\n" for a, b in zip(T, X, strict=True))
+    (tmp_path / name).write_text("seconds_elapsed,z,y,x\n" + rows)
+    (recording,) = understand(read_table(tmp_path / name))
+    assert {column.quantity for column in recording.columns} == {quantity}
+    assert any("The file's name says" in note for note in recording.notes) == (quantity != "position")

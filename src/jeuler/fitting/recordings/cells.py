@@ -13,6 +13,10 @@ MISSING = frozenset(
 NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?", re.ASCII)
 DATE = re.compile(r"(\d{1,4})([-/.])(\d{1,2})\2(\d{1,4})(?:[T\s]+(.+))?", re.ASCII)
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,:](\d{1,9}))?)?\s*([AaPp]\.?[Mm]\.?)?", re.ASCII)
+NAMED_MONTH = re.compile(r"(\d{1,2})[-/ ]([A-Za-z]{3})[a-z]*\.?[-/ ](\d{4})(?:[T\s]+(.+))?", re.ASCII)
+MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+MINUTES = re.compile(r"(\d{1,3}):([0-5]\d)[.,](\d{1,9})", re.ASCII)
+THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(,\d{3})+\.\d*|(\.\d{3})+,\d*)", re.ASCII)
 ZONE = re.compile(r"\s*(Z|UTC|GMT|[+-]\d{2}:?\d{2})$")
 
 
@@ -29,7 +33,10 @@ def number(cell: str, comma: bool = True) -> float:
     if not NUMBER.fullmatch(cell):
         if is_missing(cell):
             return math.nan
-        raise ValueError
+        found = THOUSANDS.fullmatch(cell)
+        if not found or (found.group(2) and not comma):
+            raise ValueError
+        return float(cell.replace(",", "") if found.group(1) else cell.replace(".", "").replace(",", "."))
     if "," in cell:
         if not comma:
             raise ValueError
@@ -46,6 +53,11 @@ def moment(cell: str) -> tuple[int | None, float | None] | None:
     if found := DATE.fullmatch(cell):
         first, _, second, third, clock = found.groups()
         day = _day(int(first), int(second), int(third), len(first) > 2)
+        seconds = _seconds(clock) if clock else None
+        return None if day is None or (clock and seconds is None) else (day, seconds)
+    if (found := NAMED_MONTH.fullmatch(cell)) and found.group(2).lower() in MONTHS:
+        first, month, third, clock = found.groups()
+        day = _day(int(third), MONTHS.index(month.lower()) + 1, int(first), year_first=True)
         seconds = _seconds(clock) if clock else None
         return None if day is None or (clock and seconds is None) else (day, seconds)
     clock_only = _seconds(cell)
@@ -68,6 +80,8 @@ def _day(first: int, second: int, third: int, year_first: bool) -> int | None:
 
 
 def _seconds(cell: str) -> float | None:
+    if found := MINUTES.fullmatch(cell):  # minutes, seconds and a fraction: a video's time
+        return int(found.group(1)) * 60 + int(found.group(2)) + float("0." + found.group(3))
     found = CLOCK.fullmatch(cell)
     if not found:
         return None

@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 
+from jeuler.fitting.recordings.table import counted
+
 LEAST_ROWS = 5
 MOST_RUNS = 200
 
@@ -40,9 +42,9 @@ class Sampling:
         if self.jitter > 0.02:
             parts.append(f"steps uneven by {100 * self.jitter:.2g} %")
         if self.gaps:
-            parts.append(f"{self.gaps} gaps, the longest {self.longest_gap:.3g} s")
+            parts.append(f"{counted(self.gaps, 'gap')}, the longest {self.longest_gap:.3g} s")
         if self.repeated:
-            parts.append(f"{self.repeated} repeated time stamps")
+            parts.append(counted(self.repeated, "repeated time stamp"))
         return ", ".join(parts)
 
 

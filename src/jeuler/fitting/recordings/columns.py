@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from jeuler.fitting.recordings.table import Table
-from jeuler.fitting.recordings.units import SI, axis_of, quantity_of, split_run, split_unit, unit_of
+from jeuler.fitting.recordings.units import SI, axis_of, file_quantity, quantity_of, split_run, split_unit, unit_of
 
 EPOCHS = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "us"), (1e11, 1e-3, "ms"))  # since 1970, by size
 
@@ -56,6 +56,8 @@ def describe(table: Table, units: dict[str, str]) -> list[Column]:
             raise ValueError(
                 f"--unit: {unit!r} is a unit of {by_unit[0]}, and {name!r} is a time; write {name}=ms, say"
             )
+        if by_name == "position" and not unit and name.lower() in ("x", "y", "z"):
+            by_name = file_quantity(table.source) or by_name
         quantity, factor = _quantity("" if name in units else by_name, by_unit, unit)
         if quantity == "index" and not _counts(table.values[:, k]):
             quantity = ""

@@ -8,16 +8,15 @@ import dataclasses
 import re
 
 from jeuler.fitting.recordings.cells import is_missing, is_value, shown
-from jeuler.fitting.recordings.table import listed
-from jeuler.fitting.recordings.units import is_unit, quantity_of
+from jeuler.fitting.recordings.table import Line, listed
+from jeuler.fitting.recordings.units import is_unit, quantity_of, split_unit
 
 SEPARATORS = (";", "\t", ",", " ")
 SAMPLE_LINES, SAMPLE_CHARACTERS = 200, 2_000_000
 DECIMAL_COMMAS = "; decimal commas cannot be told from separators: export with semicolons or with decimal points"
+NUMBERS_ABOVE = 5  # a header may hold lines of numbers, such as those of its markers: names come within so many lines
 HEADER_LINES = 300  # numbers begin before this line
 ERROR_CELLS = ("#N/A", "#NA", "#DIV", "#VALUE", "#REF", "#NUM", "#NAME", "#NULL", "#WERT", "#BEZUG", "#ZAHL", "#NV")
-
-Line = tuple[int, str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,10 +88,10 @@ def _separator(name: str, lines: list[Line]) -> tuple[str, int, list[list[str]]]
         rows, shares = [], []
         for line in sample:
             cells = split(name, line, separator)
-            values = sum(map(is_value, cells))
-            if values >= 2 and len(cells) >= 2:
+            values, missing = sum(map(is_value, cells)), sum(map(is_missing, cells))
+            if values >= 1 and values + missing >= 2:
                 rows.append(cells)
-                shares.append((values + sum(map(is_missing, cells))) / len(cells))
+                shares.append((values + missing) / len(cells))
         if not rows:
             continue
         width = collections.Counter(map(len, rows)).most_common(1)[0][0]
@@ -117,7 +116,7 @@ def _head(name: str, lines: list[Line], separator: str, width: int, text: frozen
         cells = split(name, line, separator)
         good = len(cells) == width and any(map(is_value, cells))
         if good and all(j in text or is_value(cell) or is_missing(cell) for j, cell in enumerate(cells)):
-            first_good = k
+            first_good = _below_names(name, lines, k, separator, width)
             break
     if first_good == len(lines):
         first_good = min(len(lines), HEADER_LINES)
@@ -132,6 +131,18 @@ def _head(name: str, lines: list[Line], separator: str, width: int, text: frozen
             begin = k
             break
     return lines[:begin], begin
+
+
+def _below_names(name: str, lines: list[Line], k: int, separator: str, width: int) -> int:
+    """The first line of data: ``k``, or after the line of names that follows close by, if none stands above."""
+
+    def names(line: Line) -> bool:
+        cells = split(name, line, separator)
+        return len(cells) == width and all(cells) and not any(is_value(cell) or is_missing(cell) for cell in cells)
+
+    if any(map(names, lines[:k])):
+        return k
+    return next((j + 1 for j in range(k + 1, min(k + NUMBERS_ABOVE, len(lines) - 1)) if names(lines[j])), k)
 
 
 def _header_cells(name: str, line: Line, separator: str, width: int) -> list[str]:
@@ -175,13 +186,18 @@ def _names(
     named = [row for row in rows if row is not units] or [row for row in comments if row and row is not units]
     if not named and rows:
         named, units = rows, None  # names that could be units: t, m
-    names = max(named, key=lambda row: sum(map(bool, row))) if named else None
+    names = max(named, key=lambda row: (sum(map(bool, row)), _known(row))) if named else None
     notes = []
     if names is not None and not rows:
         notes.append("The names stand in a comment.")
     if units is not None:
         notes.append("A row of units stands above the data.")
     return names, units or [""] * width, tuple(notes)
+
+
+def _known(row: list[str]) -> int:
+    """How many cells name a quantity or hold a unit: a title of as many words as there are columns does so rarely."""
+    return sum(quantity_of(cell) != "" or split_unit(cell)[1] != "" for cell in row)
 
 
 def _are_units(row: list[str]) -> bool:

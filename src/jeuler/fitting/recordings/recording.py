@@ -10,6 +10,7 @@ import numpy as np
 from jeuler.fitting.recordings.clock import Sampling, restarts, sampling
 from jeuler.fitting.recordings.columns import Column, describe, find_index
 from jeuler.fitting.recordings.table import Table, listed
+from jeuler.fitting.recordings.units import file_quantity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +51,11 @@ def understand(
     """
     columns = find_index(describe(table, units or {}), table)
     notes, warnings = list(table.notes), []
+    hinted = [
+        c.name for c in columns if c.name.lower() in ("x", "y", "z") and c.quantity == file_quantity(table.source)
+    ]
+    if hinted and not any(c.unit for c in columns if c.name in hinted):
+        notes.append(f"The file's name says that {listed(hinted)} hold the {file_quantity(table.source)}.")
     if time is not None:
         clock = columns[_find_name(table, time)]
         clock = clock if clock.quantity == "time" else dataclasses.replace(clock, quantity="time", factor=1.0, unit="")

@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 
+Line = tuple[int, str]  # its number in the file, and its text
+
 
 @dataclasses.dataclass(frozen=True)
 class Table:
@@ -47,6 +49,11 @@ def named(given: list[str], first: str = "") -> list[str]:
         taken.add(name)
         names.append(name)
     return names
+
+
+def counted(count: int, thing: str) -> str:
+    """A count and what is counted: 1 gap, 2 gaps."""
+    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
 
 
 def listed(names: list[str], most: int = 12, longest: int = 60) -> str:

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from jeuler.fitting.recordings.cells import MISSING, moment, number, shown
-from jeuler.fitting.recordings.layout import DECIMAL_COMMAS, Layout, Line, find_layout, is_comment, split
-from jeuler.fitting.recordings.table import Table, listed, named
+from jeuler.fitting.recordings.layout import DECIMAL_COMMAS, Layout, find_layout, is_comment, split
+from jeuler.fitting.recordings.loggers import table_of_labels, without_stamps
+from jeuler.fitting.recordings.table import Line, Table, counted, listed, named
 
 DAY = 86_400.0
 
@@ -18,13 +19,14 @@ DAY = 86_400.0
 def read_text(source: str, text: str, skip: int = 0, notes: tuple[str, ...] = ()) -> Table:
     """The table in a text; ``skip``: how many lines at its top to leave out."""
     comments, lines = _lines(source, text, skip)
+    lines = without_stamps(table_of_labels(lines))
     if not lines:
         raise ValueError(f"{source}: no data, expected rows of a time and at least one value")
     layout = find_layout(source, lines, comments)
     body = lines[layout.begin :]
     among = [number for number, _ in comments if body and number > body[0][0]]
     if among:
-        notes = (*notes, f"{len(among)} comments among the data were left out, the first at line {among[0]}.")
+        notes = (*notes, f"{counted(len(among), 'comment')} among the data left out, the first at line {among[0]}.")
     if not body:
         raise ValueError(f"{source}: line {lines[0][0]}: only names and no numbers, expected rows of numbers")
     names = named(layout.names or [""] * layout.width, "" if layout.names else "t")

@@ -8,6 +8,7 @@ import than a recording to read.
 from __future__ import annotations
 
 import math
+import os
 import re
 
 G = 9.80665
@@ -98,6 +99,7 @@ _SUPERSCRIPT = str.maketrans(
     {"²": "^2", "³": "^3", "⁻": "^-", "¹": "1", "μ": "µ", "·": ".", "⋅": ".", "∙": ".", "º": "°"}
 )
 _POWER = {"ms^-1": "m/s", "ms^-2": "m/s^2", "m.s^-1": "m/s", "m.s^-2": "m/s^2", "rads^-1": "rad/s", "rad.s^-1": "rad/s"}
+_POWER |= {spelling.replace("^", ""): unit for spelling, unit in _POWER.items()}
 _RUN = re.compile(
     r"\b(?:run|data ?set|trial|take|lauf|messung|durchgang)\s*[#:]?\s*(\d+)\b\s*:?|\b(latest)\s*:", re.IGNORECASE
 )
@@ -151,10 +153,17 @@ def split_run(name: str) -> tuple[str, str]:
 def quantity_of(name: str) -> str:
     """The quantity that a name tells, its unit left aside; "" if none."""
     base = split_unit(split_run(name)[0])[0].lower().strip("\"' ")
+    spaced = base.replace("_", " ")
     for quantity, pattern in QUANTITIES:
-        if re.search(pattern, base):
+        if re.search(pattern, base) or re.search(pattern, spaced):
             return quantity
     return ""
+
+
+def file_quantity(source: str) -> str:
+    """The quantity of columns x, y, z that a file's name tells, where each sensor has a file of its own; "" if none."""
+    name = os.path.basename(source).lower()
+    return "acceleration" if "acceler" in name else "angular velocity" if "gyro" in name else ""
 
 
 def axis_of(name: str) -> tuple[str, str]:
