@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -30,17 +31,25 @@ KS, KD = 20.0, 0.05
 EDGES = "1-anchor,1-2,2-anchor"
 
 
-def whole(*arguments: str, limit: float = 120) -> tuple[int, float, float, str]:
-    """Exit code, seconds, MB at most and standard error of ``python -m jeuler ARGUMENTS`` as a process of its own."""
+def whole(
+    *arguments: str, limit: float = 120, after: Callable[[], bool] | None = None
+) -> tuple[int, float, float, str]:
+    """Exit code, seconds, MB at most and standard error of ``python -m jeuler ARGUMENTS`` as a process of its own.
+
+    Killed after ``limit`` seconds, which are counted from when ``after()`` is true, if it is given.
+    """
     started = time.perf_counter()
     with tempfile.TemporaryFile("w+") as error:
         command = [sys.executable, "-m", "jeuler", *arguments]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=error)
-        while time.perf_counter() - started < limit:
+        counted = None if after else started
+        while counted is None or time.perf_counter() - counted < limit:
+            if counted is None and after():
+                counted = time.perf_counter()
             pid, status, usage = os.wait4(process.pid, os.WNOHANG)
             if pid:
                 break
-            time.sleep(0.02)
+            time.sleep(0.002 if after else 0.02)
         else:
             process.kill()
             _, status, usage = os.wait4(process.pid, 0)
@@ -170,9 +179,11 @@ def killed(count: str = "20") -> None:
         for k in range(int(count)):
             for path in outputs:
                 pathlib.Path(path).write_text("old")
-            # every second one in the last part, where the outputs are written
-            moment = random.uniform(0.6 * duration if k % 2 else 0.0, 1.05 * duration)
-            whole(*arguments, limit=moment)
+            # every second one while the outputs are written: from when the first of them has changed or has begun to
+            begun = (lambda: any(p.name.startswith(".jeuler") for p in pathlib.Path().iterdir())) if k % 2 else None
+            whole(*arguments, limit=random.uniform(0, 0.4) if begun else random.uniform(0, duration), after=begun)
+            for left in pathlib.Path().glob(".jeuler-*"):
+                left.unlink()
             for path, ending in outputs.items():
                 text = pathlib.Path(path).read_text()
                 states["old" if text == "old" else "whole" if text.rstrip().endswith(ending.strip()) else "torn"] += 1

@@ -1,11 +1,15 @@
 """Outputs: whole or not at all; links followed, pipes and devices written into, folders refused."""
 
 import os
+import pathlib
 import socket
+import subprocess
+import sys
 import threading
 
 import pytest
 
+from jeuler._core import files
 from jeuler._core.files import check_output, write_atomically
 
 
@@ -106,3 +110,23 @@ def test_longest_name(tmp_path):
     path = tmp_path / ("a" * 251 + ".txt")
     write_atomically(path, writes("new"))
     assert path.read_text() == "new"
+
+
+def test_a_kill_in_the_middle_leaves_what_was_there(tmp_path):
+    """A process of its own that ends without any clean-up while it writes, and one just before the file takes its place."""
+    source = pathlib.Path(files.__file__)
+    for ending in ("os._exit(9)", "module.os.replace = lambda *_: os._exit(9)"):
+        (tmp_path / "out.json").write_text("old")
+        code = f"""
+import importlib.util, os
+spec = importlib.util.spec_from_file_location("files", {str(source)!r})
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+def write(path):
+    open(path, "w").write("half of it")
+    {ending}
+module.write_atomically("out.json", write)
+"""
+        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False)
+        assert done.returncode == 9
+        assert (tmp_path / "out.json").read_text() == "old"

@@ -125,6 +125,9 @@ def starting_values(
     ks = np.full(springs, asked.get("ks", mean_mass * omega**2))
     kd = np.full(springs, asked.get("kd", 2 * mean_mass * guess.decay_rate))
     mass = np.where(np.isnan(model.mass), mean_mass, model.mass)
+    own = 0.0
+    if model.spring_mass and not asked and not np.isnan(model.mass).any():
+        ks[:], own = _one_spring(model, measured)
     coupled = bool(model.pairs) and not model.places
     start: dict[str, Any] = {}
     if model.delay and not model.places:
@@ -142,11 +145,11 @@ def starting_values(
         if np.isnan(model.delay).any():
             start["delay"] = np.zeros(np.isnan(model.delay).sum())
     else:
-        start |= state_start(model, measured, ks, kd, np.maximum(mass, 1e-9))
+        start |= state_start(model, measured, ks, kd, np.maximum(mass + own, 1e-9))
     if np.isnan(model.mass).any():
         start["mass"] = mass[np.isnan(model.mass)]
     if model.spring_mass:
-        start["spring_mass"] = np.asarray(0.0)
+        start["spring_mass"] = np.asarray(own)
     speed = max(model.slow * 50, 1e-12)
     if "quadratic" in model.friction:
         start["quadratic"] = np.asarray(0.3 * kd.mean() / speed)
@@ -159,6 +162,21 @@ def starting_values(
     if model.drift and "drift" not in start:
         start["drift"] = np.zeros((model.drift, model.particles, model.dim))
     return start, model.pendulum or model.places or model.cubic or bool(asked) or (coupled and model.dim > 1)
+
+
+def _one_spring(model: Model, measured: Measurement) -> tuple[float, float]:
+    """ks and the spring's own mass from the frequency of each recording: ks = (mass + own) omega^2, least squares."""
+    squares = np.array(
+        [
+            estimate_oscillation(measured.times, column).angular_frequency ** 2
+            for column in measured.positions.swapaxes(0, 1)
+        ]
+    )
+    design = np.stack([np.ones_like(squares), -squares], axis=1)
+    ks, own = np.linalg.lstsq(design / squares[:, None], model.mass, rcond=None)[0]
+    if ks > 0 and 0 < own < model.mass.mean():
+        return float(ks), float(own)
+    return float(np.mean(model.mass * squares)), 0.0
 
 
 def _places(model: Model, measured: Measurement) -> dict[str, Any]:

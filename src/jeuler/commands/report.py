@@ -317,7 +317,7 @@ def _trust(result: dict[str, Any]) -> str:
                 words.append(f"{name}{where} not determined")
             else:
                 words.append(f"{name}{where} to {_percent(200 * error / abs(value))}")
-    ending = " (95 %), if the model is right" + ("; see the warnings" if result["warnings"] else "")
+    ending = " (95 %), if the model and the mass are right" + ("; see the warnings" if result["warnings"] else "")
     return ", ".join(words) + ending
 
 
