@@ -118,10 +118,10 @@ def test_the_scene_is_fitted_under_vmap_and_its_gradient_is_that_of_the_optimum(
         sigma = jnp.asarray([[jnp.inf], [1e-3]])
         return jeuler.fit_springs(scene(ks=95.0), STATE, T[:41], y, dt=0.025, sigma=sigma, tolerance=1e-9).ks
 
-    together = jax.vmap(stiffness)(many)
+    together = jax.jit(jax.vmap(stiffness))(many)
     alone = [stiffness(y) for y in many]
     np.testing.assert_allclose(together, alone, rtol=1e-4)
-    slope = jax.grad(stiffness)(many[0])
+    slope = jax.jit(jax.grad(stiffness))(many[0])
     step = np.zeros(many[0].shape)
     step[20, 1, 0] = 1e-5
     np.testing.assert_allclose(
