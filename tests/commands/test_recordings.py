@@ -170,3 +170,24 @@ def test_two_carts_from_their_own_rests(folder):
         assert found[edge]["kd"] == 0 or abs(found[edge]["kd"] - kd) < 4 * found[edge]["kd_stderr"]
         assert found[edge]["ks_stderr"] < 0.02 * ks + 0.05
     assert told["rms"] < 0.32
+
+
+@pytest.mark.parametrize(("name", "unit"), [("Force (N)", "N"), ("U (V)", "V")])
+def test_what_a_sensor_says_of_the_motion_is_fitted_in_its_own_unit(folder, name, unit):
+    (folder / "f.csv").write_text(f"Time (s),{name}\n" + quirks.table(quirks.T, quirks.swing()))
+    measured = selected("f.csv")
+    assert (measured.names, measured.unit) == ([name], unit)
+    assert any(
+        "fitted as if it were a position" in note and f"amplitudes are in {unit}" in note for note in measured.notes
+    )
+    told = fitted("f.csv", "--mass", 0.25)
+    assert abs(told["springs"][0]["ks"] / quirks.KS - 1) < 0.005
+    assert abs(told["springs"][0]["kd"] / quirks.KD - 1) < 0.05
+    assert (told["unit"], told["warnings"]) == (unit, [])
+
+
+def test_few_samples_a_period_and_a_gap_are_no_release_and_no_second_motion(folder):
+    t = np.arange(430) / 9.0
+    seen = (t < 16) | (t > 24)
+    (folder / "g.csv").write_text("t (s),x (m)\n" + quirks.table(t[seen], quirks.swing(t, phase=0.1, noise=2e-3)[seen]))
+    assert fitted("g.csv", "--mass", 0.25)["warnings"] == []

@@ -15,6 +15,7 @@ from jeuler.fitting.recordings.table import counted, listed
 from jeuler.fitting.spectrum import strong_lines
 
 LARGE_RESIDUAL = 0.02  # of the spread of the data
+STILL_ROWS = 5  # fewer without motion may be chance
 DRIFT = 0.3  # of the residual's variance in a slow polynomial: the zero drifts
 LARGE_ANGLE = 0.35  # rad: the period of a pendulum is 0.8 % longer there
 
@@ -74,8 +75,11 @@ def _motion_words(measured: Measurement, found: Estimate, guess: Oscillation) ->
         known = [mode.angular_frequency for mode in found.modes]
         width = 2 * np.pi / float(np.ptp(measured.times))
         lines = {round(o, 6): a for column in flat.T for o, a in strong_lines(measured.times, column)}
+        largest = 3 * float(np.sqrt(np.nanmean(_residual(measured, found)[0] ** 2)))  # what is fitted is in no residual
         unexplained = [
-            o for o in lines if all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))
+            o
+            for o, amplitude in lines.items()
+            if amplitude < largest and all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))
         ]
         if unexplained:
             frequencies = listed([f"{o / (2 * np.pi):.3g} Hz" for o in sorted(unexplained)])
@@ -127,7 +131,7 @@ def _held(times: np.ndarray, flat: np.ndarray) -> float:
     start = np.nanmedian(moving[:5], axis=0)
     away = np.abs(moving - start) > 0.05 * (np.nanmax(moving, axis=0) - np.nanmin(moving, axis=0))
     first = int(np.argmax(away.any(axis=1)))
-    return float(times[first] - times[0])
+    return float(times[first] - times[0]) if first >= STILL_ROWS else 0.0
 
 
 def _residual_words(measured: Measurement, found: Estimate, guess: Oscillation) -> Iterator[str]:

@@ -20,6 +20,7 @@ OBSERVED = (
     "velocity",
     "angular velocity",
 )  # the first of these that the file has is taken
+ALIKE = ("force", "voltage")  # or else one of these: what a sensor says of a motion has its frequency and its decay
 
 
 def resolve(name: str, available: list[str]) -> str | None:
@@ -81,7 +82,7 @@ def _quantity(recording: Recording, usable: list[Column], observe: str | None) -
                 f"{listed([f'{c.name} ({c.quantity})' for c in usable])}; choose with --columns"
             )
         return observe if observe in there else ""
-    for quantity in OBSERVED:
+    for quantity in (*OBSERVED, *ALIKE):
         if quantity in there:
             return quantity
     if "" in there:

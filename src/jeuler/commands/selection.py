@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeuler.commands.channels import choose_columns, input_column, resolve
+from jeuler.commands.channels import OBSERVED, choose_columns, input_column, resolve
 from jeuler.fitting.oscillation import estimate_oscillation
 from jeuler.fitting.recordings.clock import Sampling, sampling
 from jeuler.fitting.recordings.columns import Column
@@ -117,7 +117,15 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
             f"Neither name nor unit says what {listed(untold)} is: taken as a position in m. "
             f"Correct it with --observe or --unit."
         )
-    unit = columns[0].unit if unknown else UNITS[quantity]
+    alike = [column for column in columns if column.quantity and column.quantity not in OBSERVED]
+    unit = columns[0].unit if unknown else columns[0].si if alike else UNITS[quantity]
+    notes = recording.notes
+    if alike:
+        notes = (
+            *notes,
+            f"{listed([c.name for c in alike])}: a {alike[0].quantity}, fitted as if it were a position, whose "
+            f"frequency and decay it has: ks and kd are right, amplitudes are in {unit or 'its own unit'}.",
+        )
     warnings += _size_words(columns, quantity, values)
     drive = _drive(recording, arguments, columns, keep)
     measured = Measurement(
@@ -132,7 +140,7 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
         quantity=quantity,
         unit=unit,
         left_out=(*recording.left_out, *left_out),
-        notes=recording.notes,
+        notes=notes,
         warnings=(*recording.warnings, *warnings),
     )
     clock = sampling(measured.times)

@@ -87,7 +87,10 @@ QUANTITIES = (
     ("acceleration", r"acceler|\bacc(el)?([^a-z]|$)|beschleunigung|^a(cc)?[\s_.-]*[xyz]\d*$|^gf[xyz]$|^a\d*$"),
     ("velocity", r"velocit|\bspeed\b|\bvel([^a-z]|$)|geschwindigkeit|vitesse|^v[\s_.-]*[xyz]?\d*$|^vel[\s_.-]*[xyz]?$"),
     ("time", r"^(t|time|zeit|temps|tiempo|tempo|clock|timestamp|date|datum|datetime|uhrzeit)([^a-z]|$)|\btime$"),
-    ("time", r"^(elapsed|seconds|millis|micros|sec|ms|seconds[\s_]elapsed|epoch)([^a-z]|$)|\b(time|timestamp|zeit)\b"),
+    (
+        "time",
+        r"^x_value$|^(elapsed|seconds|millis|micros|sec|ms|seconds[\s_]elapsed|epoch)([^a-z]|$)|\b(time|timestamp|zeit)\b",
+    ),
     ("angle", r"\b(angle|winkel|theta|phi|pitch|roll|yaw|auslenkwinkel)\b|^(theta|θ|phi|φ|angle)([^a-z]|$)"),
     ("force", r"\b(force|kraft|tension|load)\b|^f[xyz]?$"),
     ("mass", r"^(mass|masse|weight)\b"),
