@@ -58,3 +58,25 @@ def test_a_damaged_value_is_warned_of(folder, capsys):
     (folder / "d.csv").write_text("\n".join(lines))
     assert main(["fit", "d.csv", "--mass", "0.25"]) == 0
     assert "1 row far from the model, the first at 9.96 s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("\n".join(",".join([str(row)] + ["1.5"] * 5_000) for row in range(6)), "line 1: 5001 columns, at most 5000"),
+        (
+            "\n".join(",".join(["t" if row < 0 else str(row)] + ["1.5"] * 400) for row in range(6)),
+            "400 columns are of position, at most 30 are fitted without --columns",
+        ),
+        ("t,x\n" + "".join(f"{k},{1e300 * (-1) ** k}\n" for k in range(20)), "line 2: column 2 (x): 1e+300 is larger"),
+        ("t,x\n" + "".join(f"{k * 1e-300},{k % 3}\n" for k in range(20)), "column 1 (t): the times span 1.9e-299 s"),
+        ("t,x\n" + "".join(f"7,{k % 3}\n" for k in range(20)), "column 1 (t): the times span 0 s"),
+        ("t,x\n" + "".join(f"{k},{k % 3 * 1e-200}\n" for k in range(20)), "column 2 (x): moves by 2e-200 m"),
+    ],
+)
+def test_numbers_and_widths_of_no_measurement(folder, capsys, text, message):
+    (folder / "d.csv").write_text(text)
+    assert main(["fit", "d.csv"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jeuler fit: error: d.csv: " + message)
+    assert error.count("\n") == 1

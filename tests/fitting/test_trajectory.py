@@ -68,7 +68,7 @@ def test_named_time(tmp_path):
     [
         ("t,x\n0,1\n1,high\n", r"data.csv: line 3: column 2 \(x\): expected a number, got 'high'"),
         ("t,x\n0,1\n1,inf\n", r"line 3: column 2 \(x\): expected a number, got 'inf'"),
-        ("t,x\n0,1\n\n1\n", "line 4: 1 cells, expected 2: t, x"),
+        ("t,x\n0,1\n\n1\n", "line 4: 1 cell, expected 2: t, x"),
         ("t,x\n0,1\n1,2,3\n", "line 3: 3 cells, expected 2"),
         ("t,x\n0,1\n,2\n", r"line 3: column 1 \(t\): the time is missing"),
         ("", "no data"),

@@ -20,6 +20,7 @@ OBSERVED = (
     "velocity",
     "angular velocity",
 )  # the first of these that the file has is taken
+MOST_CHANNELS = 30
 ALIKE = ("force", "voltage")  # or else one of these: what a sensor says of a motion has its frequency and its decay
 
 
@@ -59,13 +60,22 @@ def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], 
         quantity = arguments.observe or columns[0].quantity
         others = [(c.name, "not among --columns") for c in recording.columns if c not in columns and c != drive]
     else:
-        usable = [c for c in usable if np.isfinite(recording.values[:, recording.columns.index(c)]).any()]
+        held = dict(zip((c.index for c in recording.columns), np.isfinite(recording.values).any(axis=0), strict=True))
+        usable = [c for c in usable if held[c.index]]
         quantity = _quantity(recording, usable, arguments.observe)
         columns = [c for c in usable if c.quantity == quantity]
+        taken, there = {c.index for c in columns}, {c.index for c in usable}
         others = [
-            (c.name, _reason(c, quantity, c in usable)) for c in recording.columns if c not in columns and c != drive
+            (c.name, _reason(c, quantity, c.index in there))
+            for c in recording.columns
+            if c.index not in taken and c != drive
         ]
     quantity = quantity if quantity in OBSERVED else "position"
+    if arguments.columns is None and len(columns) > MOST_CHANNELS:
+        raise ValueError(
+            f"{recording.source}: {len(columns)} columns are of {quantity}, at most {MOST_CHANNELS} are fitted "
+            f"without --columns: {listed([c.name for c in columns])}; choose with it"
+        )
     if arguments.columns is None and arguments.dim is None:
         columns, more = _one_channel(recording, columns)
         others += more

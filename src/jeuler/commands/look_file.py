@@ -16,6 +16,7 @@ from jeuler.fitting.recordings.table import listed
 from jeuler.fitting.spectrum import strong_lines
 
 WIDTH, HEIGHT = 72, 9
+MOST_COLUMNS = 60
 
 
 def look_file(arguments: argparse.Namespace) -> None:
@@ -29,8 +30,10 @@ def look_file(arguments: argparse.Namespace) -> None:
     for recording in recordings[:20]:
         print(f"run {recording.run}: {recording.sampling.words()}")
         print(f"  {'time':<24} {recording.clock.name} [{recording.clock.unit or 's, as no unit is given'}]")
-        for k, column in enumerate(recording.columns):
+        for k, column in enumerate(recording.columns[:MOST_COLUMNS]):
             print(f"  {column.name[:40]:<24} {_words(column, recording.values[:, k])}")
+        if len(recording.columns) > MOST_COLUMNS:
+            print(f"  and {len(recording.columns) - MOST_COLUMNS} more columns")
         for name, reason in recording.left_out:
             print(f"  {name[:40]:<24} left out: {reason}")
     if len(recordings) > 20:

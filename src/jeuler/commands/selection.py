@@ -18,6 +18,8 @@ from jeuler.fitting.spectrum import block_means, strong_lines
 from jeuler.fitting.trajectory import chosen_run
 
 LEAST_ROWS = 5
+SPANS = 1e-12, 1e12  # s
+SMALLEST = 1e-30
 THIN_ABOVE = 20_000  # rows
 SAMPLES_A_PERIOD = 40
 UNITS = {"position": "m", "angle": "rad", "acceleration": "m/s^2", "velocity": "m/s", "angular velocity": "rad/s"}
@@ -103,8 +105,22 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
             f"{recording.source}: {keep.sum()} rows{' between --from and --to' if not keep.all() else ''}, expected "
             f"{LEAST_ROWS} at least; the times run from {times.min():g} to {times.max():g} s"
         )
+    span = float(np.ptp(times[keep]))
+    if not SPANS[0] < span < SPANS[1]:
+        raise ValueError(
+            f"{recording.source}: column {recording.clock.index + 1} ({recording.clock.name[:60]}): the times span "
+            f"{span:g} s, expected {SPANS[0]:g} to {SPANS[1]:g} s; say which column is the time with --time, and its "
+            f"unit with --unit"
+        )
     places = [recording.columns.index(column) for column in columns]
     values = recording.values[:, places][keep]
+    for column, given in zip(columns, values.T, strict=True):
+        seen = given[np.isfinite(given)]
+        if len(seen) and 0 < np.ptp(seen) < SMALLEST:
+            raise ValueError(
+                f"{recording.source}: column {column.index + 1} ({column.name[:60]}): moves by {np.ptp(seen):g} "
+                f"{column.si}, less than can be told from nothing; say its unit with --unit"
+            )
     unknown = [column.name for column in columns if np.isnan(column.factor)]
     if unknown:
         warnings.append(

@@ -8,13 +8,14 @@ import dataclasses
 import re
 
 from jeuler.fitting.recordings.cells import is_missing, is_value, shown
-from jeuler.fitting.recordings.table import Line, listed
+from jeuler.fitting.recordings.table import Line, counted, listed
 from jeuler.fitting.recordings.units import is_unit, quantity_of, split_unit
 
 SEPARATORS = (";", "\t", ",", " ")
 SAMPLE_LINES, SAMPLE_CHARACTERS = 200, 2_000_000
 DECIMAL_COMMAS = "; decimal commas cannot be told from separators: export with semicolons or with decimal points"
 NUMBERS_ABOVE = 5  # a header may hold lines of numbers, such as those of its markers: names come within so many lines
+MOST_COLUMNS = 5_000
 HEADER_LINES = 300  # numbers begin before this line
 ERROR_CELLS = ("#N/A", "#NA", "#DIV", "#VALUE", "#REF", "#NUM", "#NAME", "#NULL", "#WERT", "#BEZUG", "#ZAHL", "#NV")
 
@@ -55,6 +56,11 @@ def find_layout(name: str, lines: list[Line], comments: list[Line]) -> Layout:
     separator, raw_width, sample = _separator(name, lines)
     if not raw_width:
         raise _no_table(name, lines)
+    if raw_width > MOST_COLUMNS:
+        raise ValueError(
+            f"{name}: line {lines[0][0]}: {raw_width} columns, at most {MOST_COLUMNS}; is each row a line, and the "
+            f"separator right? Save the time and the columns that matter"
+        )
     trailing = all(not cells[-1] for cells in sample)
     head, begin = _head(name, lines, separator, raw_width, _text_columns(sample, raw_width))
     rows = [_header_cells(name, line, separator, raw_width - trailing) for line in head]
@@ -212,7 +218,8 @@ def _refuse_other_width(name: str, lines: list[Line], begin: int, rows: list[lis
     if len(rows[-1]) >= 2 and begin < len(lines) and sum(quantity_of(c) != "" for c in rows[-1]) * 2 >= len(rows[-1]):
         hint = DECIMAL_COMMAS if width == 2 * len(rows[-1]) else ""
         raise ValueError(
-            f"{name}: line {lines[begin][0]}: {width} cells, expected {len(rows[-1])}: {listed(rows[-1])}{hint}"
+            f"{name}: line {lines[begin][0]}: {counted(width, 'cell')}, expected {len(rows[-1])}: "
+            f"{listed(rows[-1])}{hint}"
         )
 
 
@@ -226,7 +233,7 @@ def _no_table(name: str, lines: list[Line]) -> ValueError:
         if len(header) > 1 and any(map(is_value, cells)):
             if len(cells) != len(header):
                 return ValueError(
-                    f"{name}: line {line[0]}: {len(cells)} cells, expected {len(header)}: {listed(header)}"
+                    f"{name}: line {line[0]}: {counted(len(cells), 'cell')}, expected {len(header)}: {listed(header)}"
                 )
             bad = next((k for k, c in enumerate(cells) if not (is_value(c) or is_missing(c))), None)
             if bad is not None:

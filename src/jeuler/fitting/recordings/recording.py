@@ -12,6 +12,8 @@ from jeuler.fitting.recordings.columns import Column, describe, find_index
 from jeuler.fitting.recordings.table import Table, listed
 from jeuler.fitting.recordings.units import file_quantity
 
+LARGEST = 1e60
+
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
@@ -182,6 +184,8 @@ def _runs(
     since = np.median(np.abs(times)) > 1e8  # since 1970, or a date
     if since:
         times = (raw[:last] - raw[0]) * clock.factor
+    if ordered:
+        _refuse_senseless(table, members, values)
     back = restarts(times)
     if back is None and ordered:
         row = int(np.flatnonzero(np.diff(times) < 0)[0]) + 1
@@ -216,6 +220,17 @@ def _runs(
         )
         for k, (begin, end) in enumerate(itertools.pairwise(bounds))
     ]
+
+
+def _refuse_senseless(table: Table, members: list[Column], values: np.ndarray) -> None:
+    """One ValueError for a cell whose square no computer holds: no measurement is so large, but damage is."""
+    rows, columns = np.nonzero(np.abs(values) > LARGEST)
+    if rows.size:
+        column = members[columns[0]]
+        raise ValueError(
+            f"{table.source}: {table.where(rows[0])}: column {column.index + 1} ({column.name[:60]}): "
+            f"{values[rows[0], columns[0]]:g} is larger than any measurement; a damaged cell?"
+        )
 
 
 def longest(recordings: list[Recording]) -> Recording:

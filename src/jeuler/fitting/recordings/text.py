@@ -132,7 +132,7 @@ def _row(source: str, line: Line, layout: Layout, names: list[str]) -> list[str]
         if layout.separator == "," and len(cells) == 2 * layout.width:
             hint = DECIMAL_COMMAS
         raise ValueError(
-            f"{source}: line {line[0]}: {len(cells)} cells, expected {layout.width}: {listed(names)}{hint}"
+            f"{source}: line {line[0]}: {counted(len(cells), 'cell')}, expected {layout.width}: {listed(names)}{hint}"
         )
     return cells
 
