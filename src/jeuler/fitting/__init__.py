@@ -3,6 +3,7 @@
 from jeuler.fitting._find_springs import FoundSprings, find_springs
 from jeuler.fitting._fit import fit
 from jeuler.fitting._identifiability import Identifiability, identifiability
+from jeuler.fitting._multiple_shooting import ShootingFit, multiple_shooting
 from jeuler.fitting._springs import SpringFit, fit_springs
 from jeuler.fitting.result import Fit
 from jeuler.fitting.trajectory import Trajectory, read_trajectory
@@ -11,12 +12,14 @@ __all__ = [
     "Fit",
     "FoundSprings",
     "Identifiability",
+    "ShootingFit",
     "SpringFit",
     "Trajectory",
     "find_springs",
     "fit",
     "fit_springs",
     "identifiability",
+    "multiple_shooting",
     "read_trajectory",
 ]
 

@@ -74,7 +74,7 @@ class Motion:
         total = np.cumsum(power)
         highest = omega[np.searchsorted(total, KEPT * total[-1])] if total[-1] > 0 else 0.0
         wanted = SMOOTH / highest if highest > 0 else np.inf
-        return float(np.clip(wanted, NARROWEST * self.tracks.spacing, max(span / 8, NARROWEST * self.tracks.spacing)))
+        return float(np.clip(wanted, NARROWEST * self.tracks.spacing, max(span / 6, NARROWEST * self.tracks.spacing)))
 
 
 @dataclasses.dataclass(frozen=True)

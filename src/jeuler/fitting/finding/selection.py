@@ -19,7 +19,7 @@ from jeuler.fitting.finding.equations import TERMS, Normal
 
 BLIND = 1e-9  # of a column's square: what is left of it beside the others when it is nothing but rounding
 MOST_ROUNDS = 6
-MOST_AT_ONCE = 500  # terms up to which the search begins with all pairs and only takes away: nothing to go astray in
+MOST_AT_ONCE = 500  # terms up to which the search begins with all pairs at once: nothing to go astray in
 FAINT = 1e-4  # of a usual spring: what is softer is not told from the error of the integrals in exact data
 PATIENCE = 80  # pairs that are added beyond the best so far: many equal springs each take off only little at first
 
@@ -51,12 +51,14 @@ class Selection:
     least_seen: np.ndarray
 
 
-def select(normal: Normal, alpha: float, begin: list[int]) -> Selection:
+def select(normal: Normal, alpha: float, begin: list[int], kinds: bool = True) -> Selection:
     """Of four kinds of springs (with or without rest lengths, with or without damping) the one with the least BIC.
 
-    The search goes on from the pairs of ``begin``, if there are any.
+    The search goes on from the pairs of ``begin``, if there are any. Without ``kinds`` only the first is tried.
     """
     whole = _select(normal, (True, True, True), alpha, begin)
+    if not kinds:
+        return whole
     begin = whole.chosen.tolist()
     fewer = ((True, True, False), (True, False, True), (True, False, False))
     found = [*(_select(normal, terms, alpha, begin) for terms in fewer), whole]
@@ -80,15 +82,15 @@ def _select(normal: Normal, terms: tuple[bool, bool, bool], alpha: float, begin:
     count = normal.gram.shape[0] // len(TERMS)
     limit = _threshold(alpha / max(count, 1), len(use))
     small = len(use) * count <= min(MOST_AT_ONCE, normal.rows / 2)
-    chosen = list(range(count)) if small else list(begin)
+    chosen = _not_negative(normal, use, count) if small else list(begin)
     tried: set[tuple[int, ...]] = set()
     for turn in range(MOST_ROUNDS):
         if turn or not small:
             chosen = _forward(normal, use, chosen, limit, 0 if turn or begin else PATIENCE)
         fit = _Fit(normal, use, chosen)
         while (weak := fit.weak(limit)).any():
-            chosen = np.asarray(chosen)[~weak].tolist()
-            fit = _Fit(normal, use, chosen)
+            fit = fit.without(weak)
+        chosen = fit.chosen.tolist()
         key = tuple(sorted(chosen))
         if key in tried:
             break
@@ -96,49 +98,108 @@ def _select(normal: Normal, terms: tuple[bool, bool, bool], alpha: float, begin:
     return _Fit(normal, use, sorted(chosen)).selection(terms, limit)
 
 
+def _not_negative(normal: Normal, use: np.ndarray, count: int) -> list[int]:
+    """The pairs that non-negative least squares over all of them leaves in.
+
+    That no term is negative often decides where the equations alone would not: of many springs that nearly balance each
+    other, one would have to push.
+    """
+    from scipy.optimize import nnls
+
+    index = (len(TERMS) * np.arange(count)[:, None] + use).ravel()
+    gram = normal.gram[index][:, index].toarray()
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    keep = values > BLIND
+    root = vectors[:, keep] * np.sqrt(values[keep])
+    x, _ = nnls(
+        root.T, (vectors[:, keep].T @ (normal.slope[index] / scale)) / np.sqrt(values[keep]), maxiter=20 * len(index)
+    )
+    return np.flatnonzero(x.reshape(count, -1)[:, 0] > 0).tolist()
+
+
 def _forward(normal: Normal, use: np.ndarray, chosen: list[int], limit: float, patience: int) -> list[int]:
     """Add the pair that takes most off the sum of squares, until none takes enough, and go back to the best length.
 
     That has the least  -2 log likelihood + limit springs,  with a noise of what is left, no less than the known one.
     """
-    size = len(use)
-    count = normal.gram.shape[0] // len(TERMS)
-    index = (len(TERMS) * np.arange(count)[:, None] + use).ravel()
-    gram = normal.gram[index][:, index].tocsr()
-    slope = normal.slope[index].reshape(count, size).copy()
-    diagonal = _diagonal_blocks(gram, count, size)
-    own = diagonal.copy()
-    left, rows = normal.square, normal.rows
-    basis = np.zeros((min(rows, count * size), count * size))  # pages that are not written to cost nothing
-    free = np.ones(count, bool)
-    chosen, waiting, used = list(chosen), list(chosen), 0
+    rest, chosen = _Rest(normal, use), list(chosen)
+    rest.take(chosen)
     best_length, least = len(chosen), np.inf
     while True:
-        if not waiting:
-            noise = left / max(rows - used, 1)
-            score = rows * (np.log(noise) if noise > 1 else noise - 1) + limit * len(chosen)
-            if score < least:
-                best_length, least = len(chosen), score
-            gain, estimate = _gains(diagonal, own, slope)
-            gain = np.where(free & (estimate > 0), gain, -np.inf)
-            best = int(np.argmax(gain))
-            spent = len(chosen) > best_length + patience or used + 2 * size > rows
-            if spent or gain[best] <= limit * (1 if patience else max(noise, 1)):
-                return chosen[:best_length]
-            chosen.append(best)
-        else:
-            best = waiting.pop(0)
-        free[best] = False
-        columns = slice(best * size, (best + 1) * size)
-        root, keep = _inverse_root(diagonal[best], own[best])
-        before = basis[:used]
-        new = root[keep] @ (gram[columns].toarray() - before[:, columns].T @ before)
-        shift = root[keep] @ slope[best]
-        basis[used : used + len(new)] = new
+        noise = rest.left / max(normal.rows - rest.used, 1)
+        score = normal.rows * (np.log(noise) if noise > 1 else noise - 1) + limit * len(chosen)
+        if score < least:
+            best_length, least = len(chosen), score
+        gain, estimate = _gains(rest.diagonal, rest.own, rest.slope)
+        gain = np.where(rest.free & (estimate > 0), gain, -np.inf)
+        best = int(np.argmax(gain))
+        spent = len(chosen) > best_length + patience or rest.used + 2 * len(use) > normal.rows
+        if spent or gain[best] <= limit * (1 if patience else max(noise, 1)):
+            return chosen[:best_length]
+        chosen.append(best)
+        rest.take([best])
+
+
+class _Rest:
+    """What is left of the normal equations when the terms of some pairs are projected out.
+
+    Attributes:
+      slope: (pair, term).
+      diagonal: the blocks of each pair, (pair, term, term); ``own`` before anything was taken.
+      left: the sum of squares.
+      used: how many terms were taken.
+      free: which pairs were not, (pair,).
+    """
+
+    def __init__(self, normal: Normal, use: np.ndarray) -> None:
+        size, count = len(use), normal.gram.shape[0] // len(TERMS)
+        index = (len(TERMS) * np.arange(count)[:, None] + use).ravel()
+        self.gram = normal.gram[index][:, index].tocsr()
+        self.slope = normal.slope[index].reshape(count, size).copy()
+        self.own = _diagonal_blocks(self.gram, count, size)
+        self.diagonal = self.own.copy()
+        self.left, self.used, self.free = normal.square, 0, np.ones(count, bool)
+        # rows that are orthogonal to each other; pages that are not written to cost nothing
+        self.basis = np.zeros((min(normal.rows, count * size), count * size))
+
+    def take(self, pairs: list[int]) -> None:
+        """Project the terms of these pairs out: at once, or one after the other where they are not independent."""
+        if not pairs:
+            return
+        size = self.slope.shape[1]
+        columns = (size * np.asarray(pairs)[:, None] + np.arange(size)).ravel()
+        before = self.basis[: self.used]
+        across = self.gram[columns].toarray() - before[:, columns].T @ before
+        root = _root(across[:, columns], self.own[pairs])
+        if root is None and len(pairs) > 1:
+            for pair in pairs:
+                self.take([pair])
+            return
+        if root is None:
+            root = _inverse_root(self.diagonal[pairs[0]], self.own[pairs[0]])
+        self._project(root @ across, root @ self.slope[pairs].ravel())
+        self.free[pairs] = False
+
+    def _project(self, new: np.ndarray, shift: np.ndarray) -> None:
+        count, size = self.slope.shape
+        self.basis[self.used : self.used + len(new)] = new
         each = new.reshape(-1, count, size)
-        slope = slope - np.einsum("k,kcs->cs", shift, each)
-        diagonal = diagonal - np.einsum("kcs,kct->cst", each, each)
-        left, used = left - float(shift @ shift), used + len(shift)
+        self.slope = self.slope - (shift @ new).reshape(count, size)
+        self.diagonal = self.diagonal - np.einsum("kcs,kct->cst", each, each)
+        self.left, self.used = self.left - float(shift @ shift), self.used + len(shift)
+
+
+def _root(block: np.ndarray, own: np.ndarray) -> np.ndarray | None:
+    """The inverse of the Cholesky factor; None where a pivot is no more than rounding of the pairs' own blocks."""
+    scale = np.sqrt(np.maximum(np.einsum("css->cs", own).ravel(), 1e-300))
+    try:
+        factor = np.linalg.cholesky(block / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        return None
+    if np.diag(factor).min() ** 2 < BLIND:
+        return None
+    return np.linalg.inv(factor) / scale
 
 
 def _diagonal_blocks(gram, count: int, size: int) -> np.ndarray:
@@ -164,18 +225,18 @@ def _gains(diagonal: np.ndarray, own: np.ndarray, slope: np.ndarray) -> tuple[np
     return gain, estimate[:, 0]
 
 
-def _inverse_root(block: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """W with W block W^T = 1 over what is not blind, and which rows these are."""
+def _inverse_root(block: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """W with W block W^T = 1 over what is not blind."""
     scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
     values, vectors = np.linalg.eigh(block / np.outer(scale, scale))
     keep = values > BLIND
-    return (vectors / np.sqrt(np.where(keep, values, 1))).T / scale, keep
+    return ((vectors / np.sqrt(np.where(keep, values, 1))).T / scale)[keep]
 
 
 class _Fit:
     """Least squares over chosen pairs, with terms that must not be negative held at 0."""
 
-    def __init__(self, normal: Normal, use: np.ndarray, chosen: list[int]) -> None:
+    def __init__(self, normal: Normal, use: np.ndarray, chosen: list[int], inverse: np.ndarray | None = None) -> None:
         self.normal, self.use, self.chosen = normal, use, np.asarray(chosen, int)
         index = (len(TERMS) * self.chosen[:, None] + use).ravel()
         self.gram = normal.gram[index][:, index].toarray()
@@ -184,16 +245,19 @@ class _Fit:
         gram, slope = self.gram / np.outer(self.scale, self.scale), slope / self.scale
         held = np.zeros(len(index), bool)
         is_ks = np.tile(use == 0, len(self.chosen))
+        self.whole = _inverse(gram) if inverse is None else inverse
+        free, inverse = np.arange(len(index)), self.whole
         while True:
-            free = np.flatnonzero(~held)
             x = np.zeros(len(index))
-            x[free] = _solved(gram[np.ix_(free, free)], slope[free])
+            x[free] = slope[free] @ (_pseudo_inverse(gram[np.ix_(free, free)]) if inverse is None else inverse)
             wrong = ~held & ~is_ks & (x < 0)
             if not wrong.any():
                 break
+            inverse = None if inverse is None else _eliminated(inverse, wrong[free])
             held |= wrong
+            free = np.flatnonzero(~held)
         self.free, self.x, self.index = free, x / self.scale, index
-        self.inverse = _inverse(gram[np.ix_(free, free)])
+        self.inverse = _pseudo_inverse(gram[np.ix_(free, free)]) if inverse is None else inverse
         self.left = float(normal.square - x @ slope)
         freedom = max(normal.rows - len(free), 1)
         self.surplus = float(np.sqrt(max(1.0, self.left / freedom)))
@@ -211,6 +275,11 @@ class _Fit:
         x = np.where(used, scaled.reshape(count, size), 0)
         taken = np.einsum("cs,cst,ct->c", x, np.linalg.pinv(block, rcond=1e-10, hermitian=True), x)
         return np.where(x[:, 0] > 0, taken, 0)
+
+    def without(self, weak: np.ndarray) -> _Fit:
+        """The same without these pairs: their rows and columns of the inverse are eliminated, not inverted again."""
+        rest = None if self.whole is None else _eliminated(self.whole, np.repeat(weak, len(self.use)))
+        return _Fit(self.normal, self.use, self.chosen[~weak].tolist(), rest)
 
     def weak(self, limit: float) -> np.ndarray:
         """The worst third of those that do not hold their place."""
@@ -258,36 +327,31 @@ class _Fit:
         return np.where(blind & (vectors[:, 0, 0] ** 2 > 1e-6), np.inf, (np.sqrt(limit) + 1.645) * error)
 
 
-def _factor(gram: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The Cholesky factor of a matrix with a unit diagonal; LinAlgError where a pivot is no more than rounding."""
-    from scipy.linalg import cho_factor
+def _inverse(gram: np.ndarray) -> np.ndarray | None:
+    """The inverse of a matrix with a unit diagonal; None where a pivot is no more than rounding."""
+    from scipy.linalg import cho_factor, cho_solve
 
-    factor = cho_factor(gram)
-    if len(gram) and np.diag(factor[0]).min() ** 2 < BLIND:
-        raise np.linalg.LinAlgError("singular")
-    return factor
-
-
-def _solved(gram: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    from scipy.linalg import cho_solve
-
-    if not len(gram):
-        return slope
-    try:
-        return cho_solve(_factor(gram), slope)
-    except np.linalg.LinAlgError:
-        return _inverse(gram) @ slope
-
-
-def _inverse(gram: np.ndarray) -> np.ndarray:
-    """The inverse, or the pseudo-inverse where the matrix has none to speak of."""
     if not len(gram):
         return gram
-    from scipy.linalg import cho_solve
-
     try:
-        return cho_solve(_factor(gram), np.eye(len(gram)))
+        factor = cho_factor(gram)
     except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(gram)
-        keep = values > BLIND
-        return (vectors[:, keep] / values[keep]) @ vectors[:, keep].T
+        return None
+    if np.diag(factor[0]).min() ** 2 < BLIND:
+        return None
+    return cho_solve(factor, np.eye(len(gram)))
+
+
+def _eliminated(inverse: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """The inverse of a matrix without these rows and columns, from its inverse."""
+    kept = ~out
+    across = inverse[np.ix_(kept, out)]
+    return inverse[np.ix_(kept, kept)] - across @ np.linalg.solve(inverse[np.ix_(out, out)], across.T)
+
+
+def _pseudo_inverse(gram: np.ndarray) -> np.ndarray:
+    if not len(gram):
+        return gram
+    values, vectors = np.linalg.eigh(gram)
+    keep = values > BLIND
+    return (vectors[:, keep] / values[keep]) @ vectors[:, keep].T

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import checks
-from jeuler.fitting.finding.equations import Motion, Normal, normal_equations
+from jeuler.fitting.finding.equations import SMOOTH, Motion, Normal, normal_equations
 from jeuler.fitting.finding.selection import Selection, select
 from jeuler.fitting.observations import checked_observations, noise_of
 from jeuler.fitting.smooth import FEWEST
@@ -68,15 +68,15 @@ class Tracked:
         """The springs that the weak form finds."""
         moving = np.isfinite(self.mass)
         half_width, force = self.motion.half_width(moving), self._known_force()
-        stiffness = np.zeros(len(self.mass))
+        stiffness = np.where(moving, (SMOOTH / half_width) ** 2, 0.0)  # as if each swung at the highest frequency
         begin: list[int] = []
-        for _ in range(PASSES):
+        for turn in range(PASSES):
             normal = normal_equations(self.motion, self.pairs, self.mass, force, half_width, stiffness)
             if not normal.rows:
                 raise ValueError(
                     f"times must show the particles together for longer, got {len(self.times)} times with gaps"
                 )
-            found = select(normal, alpha, begin)
+            found = select(normal, alpha, begin, kinds=turn == PASSES - 1)
             stiffness, begin = np.zeros(len(self.mass)), found.chosen.tolist()
             np.add.at(stiffness, self.pairs[found.chosen].ravel(), np.repeat(found.values[:, 0], 2))
             stiffness = np.where(moving, stiffness / np.where(moving, self.mass, 1), 0)

@@ -34,7 +34,7 @@ def sentences(task: Tracked, normal: Normal, found: Selection, alpha: float, hid
         yield (
             f"springs between these particles do not explain the motion: {found.surplus:.2g} times the noise is left, "
             f"{share:.2g} % of the accelerations; a particle that was not tracked, or a force that was not given, acts "
-            f"on them, and the springs below are not to be trusted"
+            f"on them, and the springs are not to be trusted"
         )
     count = len(found.chosen)
     yield (
@@ -48,6 +48,8 @@ def sentences(task: Tracked, normal: Normal, found: Selection, alpha: float, hid
         yield f"particles {_list(still)} are never seen together with all others: only what these feel is used"
     if task.nearest:
         yield f"only the {len(task.pairs)} nearest pairs were looked at; give others as candidates="
+    if not_explained(normal, found):
+        return
     rest = np.setdiff1d(np.arange(len(task.pairs)), found.chosen)
     if len(hidden):
         yield (
