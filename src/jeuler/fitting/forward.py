@@ -19,6 +19,7 @@ from jax import lax
 
 from jeuler._core.interpolate import hermite
 from jeuler._core.partition import is_array, partition
+from jeuler._jax.haste import Haste, jit_in_haste
 from jeuler.fitting.evaluate import Pair, by_blocks, directions_of
 from jeuler.particles._simulate import begin
 from jeuler.particles.state import split_state
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from jeuler.fitting.unknowns import Layout
 
 ON_NODE = 1e-9  # of a step: a time nearer to its end than this is there
-SMALL = 100_000  # numbers that all runs of a Jacobian pass through: less to run than the compiler's optimiser takes
+SMALL, MEDIUM = 100_000, 1_000_000  # numbers that all runs of a Jacobian pass through: less than the compiler takes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,12 +70,13 @@ class Forward:
     prediction: Prediction
     layout: Layout
     nodes: Nodes
-    small: bool
+    haste: Haste
 
     @classmethod
     def of(cls, prediction: Prediction, layout: Layout, data: dict[str, Any]) -> Forward:
         numbers = prediction.num_steps * data["state"].position.size * layout.size
-        return cls(prediction, layout, Nodes.of(data, prediction.num_steps), numbers <= SMALL)
+        haste: Haste = "great" if numbers <= SMALL else "some" if numbers <= MEDIUM else "none"
+        return cls(prediction, layout, Nodes.of(data, prediction.num_steps), haste)
 
     def residual_at(self, x: np.ndarray, data: dict[str, Any], parts: int = 1) -> Pair:
         """Prediction minus measurement, and a function that gives its Jacobian; ``parts`` steps for each step."""
@@ -169,8 +171,7 @@ def _kept(advance: Any, parts: Any, row: Any, steps: Any, nodes: Nodes) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _compiled(forward: Forward, rest: Any) -> Callable[..., Any]:
-    options = {"xla_backend_optimization_level": 0} if forward.small and jax.default_backend() == "cpu" else None
-    return jax.jit(functools.partial(forward.traced, rest), compiler_options=options)
+    return jit_in_haste(functools.partial(forward.traced, rest), forward.haste)
 
 
 def _chosen(x: np.ndarray, index: np.ndarray, axis: int) -> np.ndarray:

@@ -41,7 +41,6 @@ class Point(NamedTuple):
     cost: np.ndarray  # sum of the losses of what counts; inf before it was computed
     total: np.ndarray  # sum of squares over the same
     residual: np.ndarray  # weighted
-    held: np.ndarray  # which unknowns stay at a bound
     damping: np.ndarray
     growth: np.ndarray
     iterations: np.ndarray
@@ -80,7 +79,7 @@ def _products(residual: FlatResidual, loss: str) -> Products:
         return jnp.sum(rho(r / task.spread)[0]) * task.spread**2, jnp.sum(r**2), r
 
     @jax.jit
-    def step(x: Array, task: Task, held: Array, damping: Array) -> tuple[Array, Array, Array]:
+    def step(x: Array, task: Task, damping: Array) -> tuple[Array, Array]:
         r, forwards = jax.linearize(lambda x: weighted(x, task), x)
         backwards = jax.linear_transpose(forwards, x)
         slope = rho(r / task.spread)[1]
@@ -89,6 +88,7 @@ def _products(residual: FlatResidual, loss: str) -> Products:
         gradient, norms = rows[0], jnp.sqrt(jnp.mean(rows[1:] ** 2, axis=0))
         largest = jnp.max(norms)
         scale = jnp.where(norms > 1e-6 * largest, norms, jnp.maximum(largest, jnp.finfo(x.dtype).tiny))
+        held = ((x <= task.lower) & (gradient > 0)) | ((x >= task.upper) & (gradient < 0))
         unit = jnp.where(held, 0, 1 / scale)
 
         def normal(s: Array) -> Array:
@@ -96,7 +96,7 @@ def _products(residual: FlatResidual, loss: str) -> Products:
 
         s, left = conjugate_gradients(normal, -unit * gradient)
         decrease = jnp.sum(s * (left - unit * gradient)) + damping * jnp.sum(s**2)
-        return unit * s, decrease, gradient
+        return unit * s, decrease
 
     return Products(cost, step)
 
@@ -156,7 +156,7 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
             point = descend(products, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
     if not np.isfinite(point.total):
         raise ValueError(WITHOUT_A_START)
-    state = start(point.x, problem.form.size, 1)._replace(jacobian=np.zeros((0, 0)))
+    state = start(point.x, 0, 1)
     state = state._replace(**{name: getattr(point, name) for name in ("total", "residual", "nonfinite", "status")})
     more = (*known.more, f"standard errors are not computed for {len(x)} unknowns")
     told = Known(known.variance, known.noise, more)
@@ -166,8 +166,17 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
 def beginning(x: np.ndarray, m: int, nonfinite: Any = 0) -> Point:
     """The point before anything has been evaluated."""
     unknown, count = np.asarray(np.inf), np.asarray(0)
-    still = np.zeros(len(x), bool), np.asarray(0.0), np.asarray(2.0)
-    return Point(x, unknown, unknown, np.zeros(m), *still, count, np.asarray(nonfinite), np.asarray(RUNNING))
+    return Point(
+        x,
+        unknown,
+        unknown,
+        np.zeros(m),
+        np.asarray(0.0),
+        np.asarray(2.0),
+        count,
+        np.asarray(nonfinite),
+        np.asarray(RUNNING),
+    )
 
 
 def descend(
@@ -197,13 +206,7 @@ def _iterate(products: Products, point: Point, task: Task) -> Point:
     """One damped step, taken or not."""
     x, damping = point.x, point.damping
 
-    def solved(held: np.ndarray) -> list[np.ndarray]:
-        return [np.asarray(a, float) for a in products.step(x, task, held, damping)]
-
-    step, decrease, gradient = solved(point.held)
-    held = ((x <= task.lower) & (gradient > 0)) | ((x >= task.upper) & (gradient < 0))
-    if (held != point.held).any():
-        step, decrease, gradient = solved(held)
+    step, decrease = (np.asarray(a, float) for a in products.step(x, task, damping))
     freedom = max(int(np.sum(task.weights > 0)) - len(x), 1)
     offset = np.sqrt(max(float(decrease), 0.0) / len(x) / (max(float(point.cost - decrease), 1e-300) / freedom))
     near = damping == 0 and (offset <= NEAR or decrease <= 1e2 * task.precision * point.cost)
@@ -218,7 +221,6 @@ def _iterate(products: Products, point: Point, task: Task) -> Point:
             cost,
             total,
             r,
-            held,
             np.asarray(damping if damping > 1e-6 else 0.0),
             np.asarray(2.0),
             point.iterations + 1,
@@ -228,6 +230,4 @@ def _iterate(products: Products, point: Point, task: Task) -> Point:
     flat = near and abs(gain) <= 1  # worse by less than was to be gained: rounding
     status = CONVERGED if flat else STALLED if point.growth > 1e12 else RUNNING
     damping = np.asarray(max(damping * point.growth, 1e-3))
-    return point._replace(
-        held=held, damping=damping, growth=point.growth * 2, nonfinite=nonfinite, status=np.asarray(status)
-    )
+    return point._replace(damping=damping, growth=point.growth * 2, nonfinite=nonfinite, status=np.asarray(status))
