@@ -8,6 +8,7 @@ import pytest
 from advice_problems import GRAVITY, HEIGHT, STIFFNESS, on_the_floor
 
 import jeuler
+from jeuler.steps.embedded import interpolant, tsit5
 
 RATE = 0.7
 
@@ -28,6 +29,33 @@ def test_no_switch_is_passed_over(step, rtol):
     got, right = run(times), np.exp(-RATE * times)
     assert np.all(got.finished)
     assert np.max(np.abs(got.y[:, -1] / right - 1)) < 100 * rtol
+
+
+def test_a_moment_of_a_tenth_of_a_second_is_not_passed_over():
+    """Two switches, 0.1 s apart, at 57 times: off for that moment, or more."""
+    for there, rtol in ((0.0, 1e-6), (0.0, 1e-8), (3.0, 1e-8)):
+        moment = lambda t, y, time, there=there: -jnp.where((t > time) & (t <= time + 0.1), there, RATE) * y  # noqa: E731
+        run = jax.jit(jax.vmap(lambda time: jeuler.solve_adaptive(
+            moment, 1.0, t1=2.0, args=time, rtol=rtol, atol=1e-3 * rtol  # noqa: B023
+        ).y[-1]))  # fmt: skip
+        got, right = run(np.linspace(0.3, 1.7, 57)), np.exp(-1.9 * RATE - 0.1 * there)
+        assert np.max(np.abs(got / right - 1)) < 100 * rtol
+
+
+def test_the_stage_between_the_stages_lies_on_an_interpolant_of_order_4():
+    """Conditions of order on y(t + theta dt), and of its slope as the derivative in theta, at theta = 0.6 and others."""
+    matrix, weights = np.zeros((7, 7)), interpolant()
+    for stage, row in enumerate(tsit5().matrix[:6], start=1):
+        matrix[stage, : len(row)] = row
+    c, one = matrix.sum(1), np.ones(7)
+    trees = [(one, 1, 1), (c, 2, 2), (c**2, 3, 3), (matrix @ c, 3, 6), (c**3, 4, 4), (c * (matrix @ c), 4, 8)]
+    trees += [(matrix @ c**2, 4, 12), (matrix @ matrix @ c, 4, 24)]
+    for theta in (0.3, 0.6, 1.0):
+        value, slope = (np.array([p(theta) for p in part]) for part in (weights, [p.deriv() for p in weights]))
+        for tree, order, density in trees:
+            assert value @ tree == pytest.approx(theta**order / density, abs=1e-13)
+            assert slope @ tree == pytest.approx(order * theta ** (order - 1) / density, abs=1e-13)
+    np.testing.assert_allclose([p(1.0) for p in weights], tsit5().weights, atol=1e-14)
 
 
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])

@@ -98,6 +98,8 @@ class Recorded:
             raise AttributeError(name)
         return getattr(self.step, name)
 
-    def increment_with_error(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
+    def attempt(
+        self, f: VectorField, t: Any, y: PyTree, taken_over: PyTree, dt: Any, args: Any
+    ) -> tuple[PyTree, PyTree, PyTree]:
         jax.debug.callback(self.keep, t, y)
-        return self.step.increment_with_error(f, t, y, dt, args)
+        return self.step.attempt(f, t, y, taken_over, dt, args)

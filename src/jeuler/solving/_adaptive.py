@@ -35,13 +35,13 @@ class AdaptiveSolution:
       num_steps: accepted steps, int32 scalar.
       num_rejected: steps tried again with a smaller dt, int32 scalar.
       error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of its own
-        error, before the equation damps or amplifies it.
+        error, before the equation damps or amplifies it; its derivative is 0.
       finished: whether the last time was reached within max_steps; if not, the states from there on are NaN.
     Example:
       >>> import jeuler
       >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=1.0, max_steps=2, dt0=0.1)
       >>> run.t.tolist(), run.y.tolist(), int(run.num_steps), bool(run.finished)
-      ([0.0, 1.0], [1.0, nan], 1, False)
+      ([0.0, 1.0], [1.0, nan], 2, False)
     """
 
     t: Array
@@ -75,8 +75,11 @@ def solve_adaptive(
         dt <- dt min(5, max(0.2, 0.9 (e / c)^(-1/k))),   k the order of the step
 
     c is 0.1 for the method of Tsitouras, as errors of the steps add up, and 1 for the others; a tenth of that for the
-    step after a rejected one: f may jump there. The new dt is for the c of the next step. Every step sees f at its end
-    too, so that no jump is passed over.
+    step after a rejected one: f may jump there. The new dt is for the c of the next step.
+
+    Every step sees f at its end, and the method of Tsitouras also at 0.16, 0.33, 0.6 and 0.9 of it, so that a jump
+    shows in the error. Two that undo each other within a third of a step can lie between these times and leave no
+    trace: name such times in ``breaks``.
 
     A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
     block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
@@ -107,7 +110,7 @@ def solve_adaptive(
     Source: E. Hairer, S. Norsett, G. Wanner, Solving Ordinary Differential Equations I, 1993, sect. II.4 and II.9.
     """
     chosen: Any = tsit5() if step is None else step
-    if not hasattr(chosen, "increment_with_error") or chosen.order < 2:
+    if not hasattr(chosen, "attempt") or chosen.order < 2:
         raise ValueError(f"step must be an extrapolated_euler step of order 2 or more, got {step!r}")
     y0 = checks.state("y0", y0)
     checks.number("t0", t0)
@@ -160,41 +163,46 @@ def _solve_adaptive(
     asked = jnp.argsort(order)[: times.size]  # where the times are among the stops
     stops = stops[order]
 
-    def to_time(at: _Way, ends: tuple[Array, Array]) -> tuple[_Way, tuple[PyTree, Array]]:
+    def to_time(at: _Progress, ends: tuple[Array, Array]) -> tuple[_Progress, tuple[PyTree, Array]]:
         begin, end = ends
         here = between(f, breaks, begin, end) if breaks.size else f
-        at = at._replace(failed=jnp.asarray(False), tried=jnp.int32(0))
-        going = lambda at: (at.t < end) & (at.tried < max_steps)  # noqa: E731
+        if breaks.size:
+            at = at._replace(taken_over=step.start(here, begin, at.y, args))
+        at = at._replace(failed=jnp.asarray(False))
+        most = at.tried + max_steps
+        going = lambda at: (at.t < end) & (at.tried < most)  # noqa: E731
         at = bounded_while(going, lambda at: _try_step(step, here, args, end, at, rtol, atol), at, max_steps)
         reached = at.t >= end
         return at, (jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), at.y), reached)
 
     none, no_error = jnp.int32(0), jax.tree.map(jnp.zeros_like, y0)
-    start = _Way(t0, y0, jnp.asarray(dt0, times.dtype), no_error, none, none, jnp.asarray(False), none)
+    taken_over, dt0 = step.start(f, t0, y0, args), jnp.asarray(dt0, times.dtype)
+    start = _Progress(t0, y0, taken_over, dt0, no_error, none, none, jnp.asarray(False))
     end, (y, reached) = lax.scan(to_time, start, (jnp.append(t0, stops[:-1]), stops))
     y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[asked]]), y0, y)
-    return AdaptiveSolution(jnp.append(t0, times), y, end.accepted, end.rejected, end.error, reached[-1])
+    return AdaptiveSolution(jnp.append(t0, times), y, end.accepted, end.tried - end.accepted, end.error, reached[-1])
 
 
-class _Way(NamedTuple):
-    """Where a run is on its way to the next time at which it stops."""
+class _Progress(NamedTuple):
+    """What a run carries from one trial step to the next."""
 
     t: Array
     y: PyTree
+    taken_over: PyTree  # from the step before: the slope at its end
     dt: Array  # of the next step to try
     error: PyTree  # sum of the estimated errors
-    accepted: Array
-    rejected: Array
+    accepted: Array  # steps
+    tried: Array  # steps
     failed: Array  # whether the last step was rejected
-    tried: Array  # steps since the last stop
 
 
-def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Way, rtol: Any, atol: Any) -> _Way:
+def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Progress, rtol: Any, atol: Any) -> _Progress:
     """A step, taken if its error is within tolerance, and the size of the next; not past ``end``."""
     last = at.t + at.dt * (1 + 1e-3) >= end
     h = jnp.where(last, end - at.t, at.dt)
-    increment, error = step.increment_with_error(f, at.t, at.y, h, args)
+    increment, error, taken_over = step.attempt(f, at.t, at.y, at.taken_over, h, args)
     y = trees.add(at.y, increment)
+    error = lax.stop_gradient(error)
     ratio = lax.stop_gradient(error_ratio(error, at.y, y, rtol, atol))
     ratio = ratio / getattr(step, "allowed", 1.0)
     good = ratio <= jnp.where(at.failed, STRICT, 1)
@@ -203,15 +211,15 @@ def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Way, rto
     wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
     shortened = good & last  # to stop at a time: no reason for a smaller dt
     take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)  # noqa: E731
-    return _Way(
+    return _Progress(
         t=jnp.where(good, jnp.where(last, end, at.t + h), at.t),
         y=take(y, at.y),
+        taken_over=take(taken_over, at.taken_over),
         dt=jnp.where(shortened, jnp.maximum(wanted, at.dt), wanted),
         error=take(trees.add(at.error, error), at.error),
         accepted=at.accepted + good,
-        rejected=at.rejected + ~good,
-        failed=~good,
         tried=at.tried + 1,
+        failed=~good,
     )
 
 

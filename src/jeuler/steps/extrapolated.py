@@ -45,6 +45,15 @@ class ExtrapolatedStep:
         """y(t + dt) - y, what ``solve(compensated=True)`` adds."""
         return jax.tree.map(lambda row: aitken_neville(row)[0], self.rows(f, t, y, dt, args)[0])
 
+    def start(self, f: VectorField, t: Any, y: PyTree, args: Any) -> None:
+        """What the first step of `solve_adaptive` takes over: nothing."""
+
+    def attempt(
+        self, f: VectorField, t: Any, y: PyTree, taken_over: None, dt: Any, args: Any
+    ) -> tuple[PyTree, PyTree, None]:
+        """The increment with its estimated error, and what the next step takes over: nothing."""
+        return *self.increment_with_error(f, t, y, dt, args), None
+
     def increment_with_error(self, f: VectorField, t: Any, y: PyTree, dt: Any, args: Any) -> tuple[PyTree, PyTree]:
         """The increment, and its estimated error: T_kk - T_{k,k-1}, or the `jump` of an explicit base if larger."""
         rows, chain = self.rows(f, t, y, dt, args)
