@@ -5,6 +5,7 @@
     python benchmarks/recordings.py measured FOLDER      the measured files of ../shared/data
     python benchmarks/recordings.py long                 18,000 and 1,000,000 rows, 723 rows, reading 100,000 rows
     python benchmarks/recordings.py damaged [COUNT]      damaged files, each by a process of its own
+    python benchmarks/recordings.py users                six kinds of file as a new user goes: look, then its command
     python benchmarks/recordings.py killed [COUNT]       a fit killed at random moments: earlier outputs stay whole
 
 Each line: what it is, seconds by the clock, MB at most, what came out.
@@ -16,6 +17,7 @@ import json
 import os
 import pathlib
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -190,7 +192,36 @@ def killed(count: str = "20") -> None:
         print(f"{count} fits of {duration:.1f} s killed: outputs {states}", flush=True)
 
 
-PARTS = {"quirks": quirks, "measured": measured, "long": long, "damaged": damaged, "killed": killed}
+def users() -> None:
+    """Six kinds of file: ``look``, then the command that it suggests with the mass put in: two steps."""
+    import xlwt
+    from commands import quirks as made
+
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        made.write(pathlib.Path(folder))
+        book = xlwt.Workbook()
+        sheet = book.add_sheet("Raw Data")
+        columns = {"Time (s)": made.T, "Linear Acceleration y (m/s^2)": made.acceleration(seed=2)}
+        for k, (name, column) in enumerate(columns.items()):
+            sheet.write(0, k, name)
+            for row, value in enumerate(column, 1):
+                sheet.write(row, k, float(value))
+        book.save("phyphox.xls")
+        lines = (f"{1000 * t:.0f},{1000 * x:.2f}" for t, x in zip(made.T, made.swing(), strict=True))
+        pathlib.Path("arduino.txt").write_text("Ready\nmillis,dist_mm\n" + "\n".join(lines) + "\n")
+        for name in ("phyphox.csv", "phyphox.xls", "tracker.txt", "pasco.csv", "vernier.csv", "arduino.txt"):
+            look = subprocess.run(
+                [sys.executable, "-m", "jeuler", "look", name], capture_output=True, text=True, check=True
+            )
+            command = look.stdout.strip().splitlines()[-1].split("python -m jeuler fit ")[1].replace("KG", "0.25")
+            path, *arguments = shlex.split(command)
+            told, words = fitted(path, *arguments)
+            off = [100 * (told["springs"][0][name] / truth - 1) for name, truth in (("ks", KS), ("kd", KD))]
+            print(f"{name:<14} fit {command:<40} {words}  off {off[0]:+.2f} %, {off[1]:+.2f} %", *told["warnings"])
+
+
+PARTS = {"quirks": quirks, "measured": measured, "long": long, "damaged": damaged, "users": users, "killed": killed}
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:

@@ -160,7 +160,7 @@ def test_look(folder, capsys):
         "pasco.csv: 3 runs",
         "run 2: 250 rows, 0 to 9.96 s, 25 samples a second",
         "velocity, ",
-        "left out: velocity, as there is position",
+        "left out: velocity; position is fitted",
         "oscillates at 1.42",
         "fit pasco.csv --run 2 --mass KG",
     ):

@@ -74,12 +74,13 @@ def _motion_words(measured: Measurement, found: Estimate, guess: Oscillation) ->
     if not model.pairs and model.drive is None:
         known = [mode.angular_frequency for mode in found.modes]
         width = 2 * np.pi / float(np.ptp(measured.times))
-        lines = {round(o, 6): a for column in flat.T for o, a in strong_lines(measured.times, column)}
-        largest = 3 * float(np.sqrt(np.nanmean(_residual(measured, found)[0] ** 2)))  # what is fitted is in no residual
+        lines = {round(o, 6) for column in flat.T for o, _ in strong_lines(measured.times, column)}
+        left = [o for column in _residual(measured, found)[0].T for o, _ in strong_lines(measured.times, column)]
         unexplained = [
             o
-            for o, amplitude in lines.items()
-            if amplitude < largest and all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))
+            for o in lines
+            if any(abs(o - r) < 3 * width for r in left)  # gaps make lines in the data that no residual has
+            and all(abs(o - k * w) > max(0.1 * w, 3 * width) for w in known for k in (1, 2, 3))
         ]
         if unexplained:
             frequencies = listed([f"{o / (2 * np.pi):.3g} Hz" for o in sorted(unexplained)])

@@ -114,7 +114,7 @@ def _reason(column: Column, quantity: str, usable: bool) -> str:
         "absolute": "an absolute value, which has lost the sign",
         "uncertainty": "an uncertainty",
     }
-    return kinds.get(column.quantity, f"{column.quantity}, as there is {quantity or 'another'}")
+    return kinds.get(column.quantity, f"{column.quantity}; {quantity or 'another'} is fitted")
 
 
 def _named_columns(recording: Recording, text: str) -> list[Column]:

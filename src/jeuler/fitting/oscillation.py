@@ -32,8 +32,8 @@ def estimate_oscillation(times: np.ndarray, values: np.ndarray) -> Oscillation:
     moving = [c for c in values.T if np.isfinite(c).sum() >= 4 and np.ptp(c[np.isfinite(c)]) > 0]
     if not moving or span <= 0:
         raise ValueError(
-            f"nothing moves in the {values.shape[1]} columns of {len(times)} rows, or none has 4 values; "
-            f"an oscillation cannot be fitted to that"
+            f"nothing moves: no column fitted has 4 values that are not all equal in its {len(times)} rows, "
+            f"and an oscillation cannot be fitted to that"
         )
     omega = _strongest_line(times, moving, span)
     decays = [decay for column in moving if (decay := _decay(times, column, span)) is not None]
