@@ -30,6 +30,7 @@ def fit(
     starts: Any = None,
     scale: PyTree = None,
     optimizer: Any = None,
+    minibatch: int | None = None,
     max_iterations: int = 200,
     tolerance: float = 1e-4,
     stages: Iterable[PyTree] = (),
@@ -66,7 +67,10 @@ def fit(
         ten, with a fixed seed), in one batched program; or from a tree of starts with a leading axis.
       scale: for ``optimizer``: what one unit of its steps is worth, one number or a tree that params extends.
       optimizer: None for Levenberg-Marquardt, or any optax optimiser, such as ``optax.adam(0.05)``.
-      max_iterations: the most iterations in each stage.
+      minibatch: for ``optimizer``: each of its steps looks at so many rows of the data, drawn anew in every pass over
+        them: the first axis of all data, and of what the residual returns, counts samples, or windows of time that are
+        run one by one. The history then has the loss over everything after each pass.
+      max_iterations: the most iterations in each stage; with ``minibatch`` the most steps.
       tolerance: how near the minimum must be, in standard errors, by the linear model. For an optax optimiser the share
         by which the loss must decrease within 50 iterations.
       stages: weights of the residual (its structure; 0 leaves out) that are fitted one after the other before all of
@@ -90,6 +94,7 @@ def fit(
         loss_scale=loss_scale,
         starts=starts,
         optimizer=optimizer,
+        minibatch=minibatch,
         max_iterations=max_iterations,
         tolerance=tolerance,
         resume=resume,

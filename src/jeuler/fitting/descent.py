@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from jeuler.fitting import least_squares
 from jeuler.fitting.evaluate import Evaluate
 from jeuler.fitting.least_squares import State, Task
 from jeuler.fitting.losses import LOSSES
+from jeuler.fitting.minibatches import Minibatches
 from jeuler.fitting.minimise import Watch
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import Problem
@@ -36,13 +38,18 @@ def by_optax(
     unit = np.asarray(problem.layout.spread("scale", scale, 1.0), float)
     if not (np.isfinite(unit) & (unit > 0)).all():
         raise ValueError("scale must be finite and greater than 0")
-    descent = Descent(options.optimizer, evaluate, task, unit, options.tolerance, watch)
+    descent: Descent | Minibatches = Descent(options.optimizer, evaluate, task, unit, options.tolerance, watch)
+    if options.minibatch is not None:
+        descent = Minibatches(descent, problem, options.minibatch)
     best = descent.run(x, problem.stages, options.max_iterations)
     history = descent.history
     if not history or not np.isfinite(min(history)):
         raise ValueError(NOT_FINITE)
-    state = least_squares.start(best, problem.form.size, 1)
-    if problem.small:
+    state = least_squares.start(best, problem.form.size if problem.small else 0, 1)
+    if not problem.small:
+        raw = np.asarray(evaluate.residual(jnp.asarray(best), task.data)).astype(float)
+        state = state._replace(residual=np.where(task.all_weights > 0, raw * task.all_weights, 0))
+    else:
         with np.errstate(all="ignore"):
             state = least_squares.advance(evaluate, LOSSES["linear"], state, task, 1)
     near = bool(problem.small and state.offset <= 0.1)
@@ -80,44 +87,45 @@ class Descent:
             some, everything = (jnp.sum(jnp.where(w > 0, raw * w, 0) ** 2) for w in (weights, all_weights))
             return some / jnp.maximum(jnp.sum(weights > 0), 1), everything / size
 
-        def propose(z, state, value, grad, damping, *data):
+        def propose(losses, z, state, value, grad, damping, *data):
             updates, state = optimizer.update(
                 grad, state, z, value=value, grad=grad, value_fn=lambda z: losses(z, *data)[0]
             )
             z = optax.apply_updates(z, jax.tree.map(lambda u: damping * u, updates))
             return jnp.clip(z, lower, upper), state
 
-        self._value_and_grad = jax.jit(jax.value_and_grad(losses, has_aux=True))
-        self._propose = jax.jit(propose)
-        self._init, self._task, self._unit, self._tolerance, self._watch = optimizer.init, task, unit, tolerance, watch
+        self.losses, self._value_and_grad = jax.jit(losses), jax.jit(jax.value_and_grad(losses, has_aux=True))
+        self.propose = propose
+        self._propose = jax.jit(functools.partial(propose, losses))
+        self.init, self.task, self.unit, self.tolerance, self.watch = optimizer.init, task, unit, tolerance, watch
         self.history: list[float] = []
         self.nonfinite, self.still = 0, False
 
     def run(self, x: np.ndarray, stages: Sequence[np.ndarray], max_iterations: int) -> np.ndarray:
         """Through the stages, then over everything: the best point over everything."""
-        z = jnp.asarray(x / self._unit)
-        self._best, self._least = z, np.inf  # over all the data, of all stages
+        z = jnp.asarray(x / self.unit)
+        self.best, self.least = z, np.inf  # over all the data, of all stages
         for weights in stages:
             z = self._stage(z, weights, min(max_iterations, max_iterations // 4 + 10))
-        self._stage(z, self._task.all_weights, max_iterations)
-        return np.asarray(self._best, float) * self._unit
+        self._stage(z, self.task.all_weights, max_iterations)
+        return np.asarray(self.best, float) * self.unit
 
     def _stage(self, z: Any, weights: np.ndarray, max_iterations: int) -> Any:
         """Down to where the loss over what is weighted stands still: the best point for that."""
-        data = self._task.data, weights, self._task.all_weights
-        state, damping = self._init(z), 1.0
+        data = self.task.data, weights, self.task.all_weights
+        state, damping = self.init(z), 1.0
         best, least, since, self.still = z, np.inf, 0, False
-        for _ in range(0 if self._watch.interrupted else max_iterations):
+        for _ in range(0 if self.watch.interrupted else max_iterations):
             try:
                 (loss, total), gradient = self._value_and_grad(z, *data)
                 if not (np.isfinite(loss) and np.isfinite(gradient).all()):
                     self.nonfinite += 1
                     if not np.isfinite(least):
                         break
-                    z, state, damping = best, self._init(best), damping / 2
+                    z, state, damping = best, self.init(best), damping / 2
                     continue
-                self._count(z, float(total))
-                since = 0 if loss < (1 - self._tolerance) * least else since + 1
+                self.count(z, float(total))
+                since = 0 if loss < (1 - self.tolerance) * least else since + 1
                 if loss < least:
                     best, least = z, float(loss)
                 self.still = bool(loss == 0.0 or since >= PATIENCE)
@@ -127,12 +135,12 @@ class Descent:
             except KeyboardInterrupt:
                 if not self.history:
                     raise
-                self._watch.interrupted = True
+                self.watch.interrupted = True
                 break
         return best
 
-    def _count(self, z: Any, total: float) -> None:
+    def count(self, z: Any, total: float) -> None:
         self.history.append(total if np.isfinite(total) else np.inf)
-        self._watch.bar.update()
-        if total < self._least:
-            self._best, self._least = z, total
+        self.watch.bar.update()
+        if total < self.least:
+            self.best, self.least = z, total

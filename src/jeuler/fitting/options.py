@@ -17,6 +17,7 @@ class Options:
     loss_scale: float | None = None
     starts: Any = None
     optimizer: Any = None
+    minibatch: int | None = None
     max_iterations: int = 200
     tolerance: float = 1e-4
     resume: Any = None
@@ -34,6 +35,12 @@ class Options:
             raise ValueError(
                 f"optimizer must be an optax optimiser, such as optax.adam(0.05), or None, got {self.optimizer!r}"
             )
+        if self.minibatch is not None:
+            object.__setattr__(self, "minibatch", checks.count("minibatch", self.minibatch, least=1))
+            if self.optimizer is None:
+                raise ValueError(
+                    "minibatch is for an optax optimiser; leave it out, or pass optimizer=optax.adam(0.01)"
+                )
         if self.optimizer is not None:
             for name in ("starts", "resume"):
                 if getattr(self, name) is not None:

@@ -23,7 +23,7 @@ from jeuler.fitting.result import Fit
 
 def run_traced(problem: Problem, options: Options) -> Fit:
     """The fit of traced values. Words cannot be made of them: ``message`` says where to look."""
-    for name in ("optimizer", "starts", "resume"):
+    for name in ("optimizer", "minibatch", "starts", "resume"):
         if getattr(options, name) is not None:
             raise ValueError(f"{name} must be None where the fit is traced, under jit, vmap or grad")
     if options.loss != "linear" and options.loss_scale is None and not problem.absolute:
