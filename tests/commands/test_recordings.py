@@ -191,3 +191,17 @@ def test_few_samples_a_period_and_a_gap_are_no_release_and_no_second_motion(fold
     seen = (t < 16) | (t > 24)
     (folder / "g.csv").write_text("t (s),x (m)\n" + quirks.table(t[seen], quirks.swing(t, phase=0.1, noise=2e-3)[seen]))
     assert fitted("g.csv", "--mass", 0.25)["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("header", "names"),
+    [("t,x (m),y (m),z (m)", ["x (m)"]), ("t,x_A (m),x_B (m),y_A (m)", ["x_A (m)", "x_B (m)"])],
+)
+def test_an_axis_along_which_nothing_moves_is_left_out(folder, header, names):
+    still = np.full(250, 0.1)
+    second = quirks.swing(seed=1) if len(names) == 2 else still
+    (folder / "s.csv").write_text(header + "\n" + quirks.table(quirks.T, quirks.swing(), second, still))
+    measured = selected("s.csv")
+    assert measured.names == names
+    assert "nothing moves" in dict(measured.left_out)[header.split(",")[-1]]
+    assert measured.positions.shape == (250, len(names), 1)

@@ -77,8 +77,9 @@ def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], 
             f"without --columns: {listed([c.name for c in columns])}; choose with it"
         )
     if arguments.columns is None and arguments.dim is None:
+        columns, still = _without_still(recording, columns)
         columns, more = _one_channel(recording, columns)
-        others += more
+        others += still + more
     columns, dim = _particles(recording.source, columns, arguments)
     return columns, quantity, dim, others
 
@@ -152,6 +153,20 @@ def _split_names(text: str, available: list[str]) -> list[str]:
         names.append(found or parts[0])
         parts = parts[count if found else 1 :]
     return names
+
+
+def _without_still(recording: Recording, columns: list[Column]) -> tuple[list[Column], list[tuple[str, str]]]:
+    """The columns without axes, or channels, along which nothing moves: a residual of 0 makes errors too small."""
+    seen = np.isfinite(recording.values)
+    moves = [
+        bool(np.ptp(v[there])) if there.any() else False for v, there in zip(recording.values.T, seen.T, strict=True)
+    ]
+    moving = [c for c, moved in zip(recording.columns, moves, strict=True) if moved and c in columns]
+    axes = {c.axis for c in moving}
+    kept = [c for c in columns if c.axis in axes] if all(c.axis for c in columns) else moving
+    if not kept:
+        return columns, []
+    return kept, [(c.name, "nothing moves there; choose it with --columns") for c in columns if c not in kept]
 
 
 def _one_channel(recording: Recording, columns: list[Column]) -> tuple[list[Column], list[tuple[str, str]]]:
