@@ -26,11 +26,11 @@ from jeuler.fitting.observations import horizons
 from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes, modes_of
 from jeuler.fitting.spectrum import strong_lines
 from jeuler.fitting.unknowns import Layout, readable
-from jeuler.particles.scene import Scene
 
 STEPS_A_PERIOD, FEWER_STEPS = 80, 40  # FEWER_STEPS where the run would take more than MANY_STEPS in all
 MANY_STEPS = 100_000
 MOST_STEPS = 1_000_000
+MOST_POINTS = 4000  # that are drawn
 NOT_NEGATIVE = ("kd", "quadratic", "dry")
 
 
@@ -43,8 +43,9 @@ class Estimate:
       stderr: of the same structure, for residuals correlated as these are; inf where not determined.
       widening: the factor by which standard errors are larger than for white residuals.
       at_zero: the parameters that ended at their bound 0, in words.
-      predicted: at the measured times, (time, particle, dim).  dt: step size, s.
-      loss: mean square of the residual.  iterations, converged, message: of the descent.  scene, mass: as fitted.
+      predicted: at the measured times, (time, particle, dim).  curve: times, (t,), and what is observed at the model's
+        own steps, (t, particle, dim), thinned to be drawn.  dt: step size, s.
+      loss: mean square of the residual.  iterations, converged, message: of the descent.  mass: as fitted.
       correlation: names of the fitted numbers and the correlation of their errors.  history: the loss.
     """
 
@@ -54,12 +55,12 @@ class Estimate:
     widening: float
     at_zero: tuple[str, ...]
     predicted: np.ndarray
+    curve: tuple[np.ndarray, np.ndarray]
     dt: float
     loss: float
     iterations: int
     converged: bool
     message: str
-    scene: Scene
     mass: np.ndarray
     correlation: tuple[tuple[str, ...], np.ndarray] | None = None
     history: Any = ()
@@ -72,9 +73,9 @@ class Estimate:
             kd = np.atleast_1d(self.params.get("kd", np.zeros_like(ks)))
             each = modes_of(equation_of_motion(self.model, ks, kd, self.mass))
             return each[:1] if self.model.shared and len(set(self.mass.tolist())) == 1 else each
-        _, state = self.model.scene(self.params)
+        scene, state = self.model.scene(self.params)
         position = np.concatenate([self.predicted.mean(axis=0), self.params["anchors"]])
-        return modes(self.scene, replace(state, position=jnp.asarray(position)))
+        return modes(scene, replace(state, position=jnp.asarray(position)))
 
 
 def guess_of(measured: Measurement) -> Oscillation:
@@ -208,7 +209,7 @@ def estimate(
     held: dict[str, Any] = {}
     params, stage = start, grow
     for _ in range(4):
-        found, predict = _descend(model, measured, params, held, scale, dt, stage, max_iterations)
+        found = _descend(model, measured, params, held, scale, dt, stage, max_iterations)
         below = {name: np.asarray(found.params[name]) < 0 for name in NOT_NEGATIVE if name in found.params}
         held, before = {name: held.get(name, False) | mask for name, mask in below.items()}, held
         if not any(mask.any() for mask in below.values()):
@@ -216,10 +217,8 @@ def estimate(
             break
         params = {k: np.where(held[k], 0.0, v) if k in held else np.asarray(v) for k, v in found.params.items()}
         stage = False
-    predicted = np.asarray(jax.jit(predict)(found.params))
-    n = model.particles
+    predicted, curve = _motion(model, measured, found.params, held, dt)
     stderr = {name: np.asarray(error) for name, error in found.stderr.items()}
-    scene, state = model.scene(found.params)
     return Estimate(
         model=model,
         params={name: np.where(held.get(name, False), 0.0, value) for name, value in found.params.items()},
@@ -227,13 +226,13 @@ def estimate(
         widening=_widening(found),
         at_zero=_held_words(model, held),
         predicted=predicted,
+        curve=curve,
         dt=dt,
         loss=float(found.loss),
         iterations=len(found.history),
         converged=bool(found.converged),
         message="converged" if found.converged else f"not converged in {len(found.history)} iterations",
-        scene=scene,
-        mass=np.asarray(state.mass)[:n],
+        mass=np.asarray(model.masses(found.params)),
         correlation=None if found.covariance is None else (Layout.of(found.params).names(readable), found.correlation),
         history=found.history,
     )
@@ -287,16 +286,15 @@ def _descend(
     dt: float,
     grow: bool,
     max_iterations: int,
-) -> tuple[Any, Any]:
+) -> Any:
     seen = np.nonzero(np.isfinite(measured.positions))
     targets = jnp.asarray(measured.positions[seen])
     begin, _ = model.grid(measured.times, dt)
 
     def predict(params: dict[str, Any]) -> jax.Array:
-        free = {k: jnp.where(jnp.asarray(held[k]), 0.0, v) if k in held else v for k, v in params.items()}
-        return model.predict(free, measured.times, dt)
+        return model.predict(_with_zeros(params, held), measured.times, dt)
 
-    found = fit(
+    return fit(
         lambda params: predict(params)[seen] - targets,
         {name: jnp.asarray(value, float) for name, value in start.items()},
         scale={name: scale[name] for name in start},
@@ -305,7 +303,25 @@ def _descend(
         tolerance=1e-7,
         progress=False,
     )
-    return found, predict
+
+
+def _with_zeros(params: dict[str, Any], held: dict[str, Any]) -> dict[str, Any]:
+    return {k: jnp.where(jnp.asarray(held[k]), 0.0, v) if k in held else v for k, v in params.items()}
+
+
+def _motion(
+    model: Model, measured: Measurement, params: dict[str, Any], held: dict[str, Any], dt: float
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """What is observed at the measured times; and at the steps, with their times."""
+    begin, steps = model.grid(measured.times, dt)
+    every = max(1, steps // (2 * MOST_POINTS))
+
+    @jax.jit
+    def observed(params: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+        return model.predict_and_trace(_with_zeros(params, held), measured.times, dt, every)
+
+    predicted, at_steps = map(np.asarray, observed(params))
+    return predicted, (begin + dt * np.arange(steps + 1)[::every], at_steps)
 
 
 def _widening(found: Any) -> float:

@@ -82,9 +82,9 @@ class Model:
 
     def masses(self, params: dict[str, Any]) -> Any:
         """Mass of each particle, with the fitted values in place of NaN and the mass of the spring added."""
-        mass = jnp.asarray(self.mass)
+        mass = self.mass
         if "mass" in params:
-            mass = mass.at[np.flatnonzero(np.isnan(self.mass))].set(params["mass"])
+            mass = jnp.asarray(mass).at[np.flatnonzero(np.isnan(mass))].set(params["mass"])
         return mass + params["spring_mass"] if "spring_mass" in params else mass
 
     def delays(self, params: dict[str, Any]) -> Any:
@@ -167,7 +167,27 @@ class Model:
     def predict(self, params: dict[str, Any], times: np.ndarray, dt: float) -> Array:
         """What is observed at the times, (time, particle, dim): between steps by cubic Hermite interpolation."""
         t0, num_steps = self.grid(times, dt)
-        motion = self.motion(params, dt, num_steps, t0)
+        return self._at_times(params, self.motion(params, dt, num_steps, t0), times, t0, num_steps, dt)
+
+    def predict_and_trace(
+        self, params: dict[str, Any], times: np.ndarray, dt: float, every: int
+    ) -> tuple[Array, Array]:
+        """`predict`, and what is observed at each ``every``-th step, of one run."""
+        t0, num_steps = self.grid(times, dt)
+        p, v, mass, scene = motion = self.motion(params, dt, num_steps, t0)
+        t = t0 + dt * jnp.arange(num_steps + 1)[::every]
+        at_steps = self.observed(params, scene, mass, t, p[::every], v[::every])
+        return self._at_times(params, motion, times, t0, num_steps, dt), at_steps
+
+    def _at_times(
+        self,
+        params: dict[str, Any],
+        motion: tuple[Array, Array, Array, Scene],
+        times: np.ndarray,
+        t0: float,
+        num_steps: int,
+        dt: float,
+    ) -> Array:
         if not self.delay or self.drive is not None:
             return self._between(params, motion, times, place_in_steps(times, t0, dt, num_steps), t0, dt)
         channels = []

@@ -14,28 +14,18 @@ EXAMPLE = {"mass": 0.5, "ks": 20.0, "kd": 0.3, "rest": 0.1, "noise": 0.001}
 
 
 def example() -> Measurement:
-    """A damped spring, solved by diffrax to 1e-10, with noise: data that the fit's own steps did not make."""
-    import diffrax
-    import jax.numpy as jnp
+    """A damped spring, by its closed form, with noise: data that the fit's own steps did not make.
 
-    def field(t, y, _):
-        x, v = y
-        force = -EXAMPLE["ks"] * (x - EXAMPLE["rest"]) - EXAMPLE["kd"] * v
-        return v, force / EXAMPLE["mass"]
-
+    x = rest + exp(-c t) (x0 cos(w t) + x0 c / w sin(w t)),  c = kd / (2 m),  w^2 = ks / m - c^2
+    """
     times = np.linspace(0.0, 8.0, 241)
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(field),
-        diffrax.Tsit5(),
-        0.0,
-        8.0,
-        1e-3,
-        (jnp.asarray(0.16), jnp.asarray(0.0)),
-        saveat=diffrax.SaveAt(ts=jnp.asarray(times)),
-        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
-    )
+    start, mass = 0.16 - EXAMPLE["rest"], EXAMPLE["mass"]
+    decay = EXAMPLE["kd"] / (2 * mass)
+    omega = math.sqrt(EXAMPLE["ks"] / mass - decay**2)
+    swing = start * (np.cos(omega * times) + decay / omega * np.sin(omega * times))
+    position = EXAMPLE["rest"] + np.exp(-decay * times) * swing
     noise = EXAMPLE["noise"] * np.random.default_rng(7).standard_normal(len(times))
-    return Measurement("built-in example", "", "t", times, (np.asarray(solution.ys[0]) + noise)[:, None, None], ["x"])
+    return Measurement("built-in example", "", "t", times, (position + noise)[:, None, None], ["x"])
 
 
 def _floats(option: str, text: str) -> list[float]:

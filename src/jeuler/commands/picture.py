@@ -5,15 +5,9 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from jeuler._core.files import write_atomically
-from jeuler.commands.estimate import Estimate
+from jeuler.commands.estimate import MOST_POINTS, Estimate
 from jeuler.commands.selection import Measurement
-
-MOST_POINTS = 4000
 
 
 def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str, Any]) -> None:
@@ -34,7 +28,7 @@ def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str,
         measured.positions[::thin].reshape(count, -1),
         found.predicted[::thin].reshape(count, -1),
         names=tuple(map(plain_text, measured.names)),
-        curve=_curve(measured, found),
+        curve=(found.curve[0], found.curve[1].reshape(len(found.curve[0]), -1)),
         title=plain_text(title),
         unit=measured.unit,
     )
@@ -42,19 +36,3 @@ def draw(measured: Measurement, found: Estimate, picture: str, result: dict[str,
     kind = os.path.splitext(os.path.realpath(picture))[1][1:].lower() or "png"
     write_atomically(picture, lambda path: figure.savefig(path, dpi=130, format=kind))
     plt.close(figure)
-
-
-def _curve(measured: Measurement, found: Estimate) -> tuple[np.ndarray, np.ndarray]:
-    """The model at its own steps."""
-    model = found.model
-    t0, steps = model.grid(measured.times, found.dt)
-    thin = max(1, steps // (2 * MOST_POINTS))
-
-    @jax.jit
-    def values(params: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
-        p, v, mass, scene = model.motion(params, found.dt, steps, t0)
-        t = t0 + found.dt * jnp.arange(steps + 1)[::thin]
-        return t, model.observed(params, scene, mass, t, p[::thin], v[::thin])
-
-    t, y = values(found.params)
-    return np.asarray(t), np.asarray(y).reshape(len(t), -1)
