@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
+from jeuler._core.component import Function
 from jeuler._core.precision import cast, flat_rows, precision
+from jeuler._jax import programs
 from jeuler.solving._breaks import checked_breaks, split_at
 from jeuler.solving._scan import advance_by, no_remainder
 from jeuler.steps.explicit import Step, VectorField
@@ -42,26 +42,10 @@ class Pilot:
         breaks: tuple[float, ...] = (),
     ) -> None:
         self.dtype, self.interval = dtype, t1 - t0
-        advance = advance_by(step, compensated=compensated)
-        if breaks:
-            with precision(dtype):
-                advance = split_at(advance, checked_breaks(breaks, dtype))
-
-        def run(y0, args, t0, dt, ends):
-            def one_step(n, state):
-                return advance(f, t0 + n.astype(dt.dtype) * dt, state, dt, args)
-
-            def segment(carry, end):
-                begin, state = carry
-                state = lax.fori_loop(begin, end, one_step, state)
-                return (end, state), state[0]
-
-            start = jnp.int32(0), (y0, no_remainder(y0, compensated))
-            return lax.scan(segment, start, ends)[1]
-
         with precision(dtype):
-            inputs = cast(y0, dtype), cast(args, dtype), jnp.asarray(t0, dtype)
-            self.program = functools.partial(jax.jit(run), *inputs)
+            known = checked_breaks(breaks, dtype) if breaks else None
+            inputs = Function(f), Function(step), cast(y0, dtype), cast(args, dtype), jnp.asarray(t0, dtype), known
+        self.program = lambda dt, ends: programs.call(_pilot_run, (*inputs, dt, ends), (compensated,))
 
     def __call__(self, num_steps: int) -> np.ndarray:
         """States at the ends of eight parts of the interval: (part, number), the last one at t1."""
@@ -69,6 +53,34 @@ class Pilot:
             ends = jnp.asarray(np.arange(1, SAMPLES + 1) * num_steps // SAMPLES, jnp.int32)
             dt = jnp.asarray(self.interval / num_steps, self.dtype)
             return flat_rows(self.program(dt, ends))
+
+
+def _pilot_run(
+    f: VectorField,
+    step: Step,
+    y0: PyTree,
+    args: PyTree,
+    t0: Array,
+    breaks: Any,
+    dt: Array,
+    ends: Array,
+    compensated: bool,
+) -> PyTree:
+    """The states after these numbers of steps."""
+    advance = advance_by(step, compensated=compensated)
+    if breaks is not None:
+        advance = split_at(advance, breaks)
+
+    def one_step(n, state):
+        return advance(f, t0 + n.astype(dt.dtype) * dt, state, dt, args)
+
+    def segment(carry, end):
+        begin, state = carry
+        state = lax.fori_loop(begin, end, one_step, state)
+        return (end, state), state[0]
+
+    start = jnp.int32(0), (y0, no_remainder(y0, compensated))
+    return lax.scan(segment, start, ends)[1]
 
 
 @dataclasses.dataclass

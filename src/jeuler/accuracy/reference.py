@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import checks, trees
+from jeuler._core.component import Function
 from jeuler._core.precision import double_precision, flat, flat_rows
+from jeuler._jax import programs
 from jeuler.steps.explicit import VectorField
 
 PyTree = Any
@@ -75,8 +77,8 @@ def make_reference(
     size = norm or np.linalg.norm
     if reference is None or isinstance(reference, diffrax.AbstractSolver):
         solver = diffrax.Dopri8() if reference is None else reference
-        run = jax.jit(lambda tolerance: accurate(f, y0, args, times, solver, tolerance))
-        loose, tight = (flat_rows(run(tolerance)) for tolerance in TOLERANCES)
+        inputs, settings = (Function(f), y0, args, _size(y0)), (tuple(times.tolist()), solver)
+        loose, tight = (flat_rows(programs.call(accurate, (*inputs, rtol), settings)) for rtol in TOLERANCES)
         if not np.all(np.isfinite(tight)):
             raise ValueError(
                 f"reference must be finite, got NaN or inf from {type(solver).__name__} at tolerance "
@@ -98,18 +100,25 @@ def make_reference(
     return Reference(times, states, 0.0)
 
 
-def accurate(f: VectorField, y0: PyTree, args: PyTree, times: Any, solver: Any, tolerance: Any) -> PyTree:
+def _size(y0: PyTree) -> float:
+    """What atol is measured by."""
+    return max(float(np.linalg.norm(flat(y0))), 1e-3)
+
+
+def accurate(
+    f: VectorField, y0: PyTree, args: PyTree, size: Any, rtol: Any, times: tuple[float, ...], solver: Any
+) -> PyTree:
     """States at the times by an adaptive diffrax solver that steps exactly to each of them. Differentiable."""
     import diffrax
 
-    control = diffrax.PIDController(rtol=tolerance, atol=tolerance * max(np.linalg.norm(flat(y0)), 1e-3))
+    control = diffrax.PIDController(rtol=rtol, atol=rtol * size)
     if len(times) > 2:
         control = diffrax.ClipStepSizeController(control, step_ts=jnp.asarray(times))
     return diffrax.diffeqsolve(
         diffrax.ODETerm(f),
         solver,
-        float(times[0]),
-        float(times[-1]),
+        times[0],
+        times[-1],
         None,
         y0,
         args,
@@ -137,7 +146,7 @@ def make_reference_gradient(
     solver = reference if isinstance(reference, diffrax.AbstractSolver) else diffrax.Dopri8()
 
     def final(args, tolerance):
-        states = accurate(f, y0, args, np.array([t0, t1]), solver, tolerance)
+        states = accurate(f, y0, args, _size(y0), tolerance, (t0, t1), solver)
         return scalar(jax.tree.map(lambda leaf: leaf[-1], states))
 
     gradient = jax.jit(jax.grad(final))

@@ -82,7 +82,7 @@ class Model:
 
     def masses(self, params: dict[str, Any]) -> Any:
         """Mass of each particle, with the fitted values in place of NaN and the mass of the spring added."""
-        mass = self.mass
+        mass: Any = self.mass
         if "mass" in params:
             mass = jnp.asarray(mass).at[np.flatnonzero(np.isnan(mass))].set(params["mass"])
         return mass + params["spring_mass"] if "spring_mass" in params else mass

@@ -14,7 +14,7 @@ import numpy as np
 from jeuler._core import trees
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler.diagnosis.rerun import GROWN, Rerun, coincident, largest, nonfinite_particles, springs_among
+from jeuler.diagnosis.rerun import GROWN, Rerun, coincident, compiled, largest, nonfinite_particles, springs_among
 from jeuler.particles._simulate import check_kinds
 from jeuler.particles.fields import declared, name_of
 from jeuler.particles.scene import Scene
@@ -203,7 +203,6 @@ def find_in_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Di
         *_, (_, state) = run.with_scene(scene).parts_of_step(n, before)
         return state.position, state.velocity
 
-    @jax.jit
     def pull_back(n, before, cotangent):
         motion = before.position, before.velocity
         _, pullback = jax.vjp(lambda scene, motion: after(scene, motion, n, before), run.scene, motion)
@@ -217,9 +216,10 @@ def find_in_gradient(run: Rerun, num_steps: int, loss: Callable[..., Any]) -> Di
         cause = "its derivative at the last state is not finite"
         remedy = "look at roots and norms of zero in the loss; write them with a double jnp.where"
         return Diagnosis(False, "gradient", num_steps, "loss", bad, cause=cause, remedy=remedy)
+    program = compiled(pull_back)
     for n in range(num_steps, 0, -1):
         before = jax.tree.map(lambda x, n=n: x[n - 1], states)
-        of_scene, pulled = pull_back(n, before, cotangent)
+        of_scene, pulled = program(jnp.int32(n), before, cotangent)
         bad = nonfinite_particles(None, *pulled)
         if bad or not bool(trees.all_finite(of_scene)):
             return gradient_in_step(run, n, before, cotangent, bad)

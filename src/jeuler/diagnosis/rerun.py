@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import checks, trees
+from jeuler._core.component import Function
 from jeuler._core.components import stack
+from jeuler._jax import programs
 from jeuler.forces import Springs
 from jeuler.particles._simulate import begin, simulate
 from jeuler.particles.equation import Equation
@@ -69,12 +71,16 @@ class Rerun:
         return dataclasses.replace(self, scene=scene, of_one=other)
 
     def parts_of_step(self, n: Any, before: ParticleState) -> Iterator[tuple[str, ParticleState]]:
-        """The name of each part of step n and the state after it."""
+        """The name of each part of step n and the state after it; all of one program, as in `simulate`."""
+        states = programs.call(_apply, (Function(self._parts_of_step), None, jnp.asarray(n, jnp.int32), before))
+        for (_, name), state in states.items():
+            yield name, state
+
+    def _parts_of_step(self, n: jax.Array, before: ParticleState) -> dict[tuple[int, str], ParticleState]:
         parts = split_state(before)
         carried = parts, no_remainder(parts[0], self.of_one.compensated)
-        n = jnp.asarray(n, jnp.int32)
-        for name, moment, _ in self.of_one.parts(n - 1, self.time(n), carried):
-            yield name, moment.state
+        after = self.of_one.parts(n - 1, self.time(n), carried)
+        return {(k, name): moment.state for k, (name, moment, _) in enumerate(after)}
 
     def before_motion(self, n: int, state: ParticleState) -> ParticleState:
         """The state that step n moves on, after births and deaths, of the one that it starts from."""
@@ -157,6 +163,17 @@ class Rerun:
 
     def huge(self) -> float:
         return float(jnp.finfo(self.state.position.dtype).max) ** 0.75
+
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """function, by a program kept from an earlier call where there is one."""
+    program = programs.prepared(_apply, (Function(function),))
+    return lambda *inputs: program(None, *inputs)
+
+
+def _apply(function: Callable[..., Any], _: None, *inputs: Any) -> Any:
+    """function(*inputs); before these stands the one input whose memory the result would take."""
+    return function(*inputs)
 
 
 def nonfinite_particles(alive: Any, *arrays: jax.Array) -> tuple[int, ...]:
