@@ -42,11 +42,12 @@ def test_lorenz_from_far_away(record, noise):
         assert (np.abs(found.params - LORENZ) < 4 * np.asarray(found.stderr)).all()
 
 
-def test_a_known_start_and_gaps_in_the_record(record):
-    """The same shapes as above but for the start, which is given."""
-    values = record.copy()
+def test_a_known_start_gaps_and_a_number_that_is_never_seen(record):
+    values, guess = record.copy(), record.copy()
     values[100:120, 1] = np.nan
-    found = fitted(values, y0=record[0])
+    values[:, 2] = np.nan
+    guess[:, 2] = 0.9 * record[:, 2]
+    found = fitted(values, y0=record[0], guess=guess)
     np.testing.assert_allclose(found.params, LORENZ, rtol=1e-3)
     np.testing.assert_array_equal(found.starts[0], record[0])
 
@@ -65,6 +66,8 @@ def test_a_model_that_is_wrong_leaves_gaps_or_misfit_and_says_so():
     [
         ({"values": np.zeros(321)}, r"values must have shape \(time, number\)"),
         ({"y0": [1.0]}, r"y0 must have shape \(3,\)"),
+        ({"values": np.where(np.arange(3) == 2, np.nan, np.ones((321, 3)) * TIMES[:, None])}, "only NaN in column 2"),
+        ({"guess": np.zeros((3, 3))}, r"guess must have shape \(321, 3\)"),
         ({"segments": 0}, "segments"),
         ({"segments": 321}, "segments must be at most"),
         ({"sigma": -1.0}, "sigma must be above 0"),

@@ -73,6 +73,7 @@ def multiple_shooting(
     dt: float,
     y0: Any = None,
     segments: int | None = None,
+    guess: Any = None,
     sigma: Any = None,
     bounds: PyTree = None,
     step: Step = rk4_step,
@@ -89,10 +90,12 @@ def multiple_shooting(
       f: ``f(t, y, params) -> dy``, y of shape (number,).
       params: starting values, any pytree of numbers.
       times: when the values were measured, (time,), s.
-      values: the state, (time, number); NaN = not observed, where a neighbour in time was.
+      values: the state, (time, number); NaN = not observed.
       dt: the longest step of the runs, s; a whole number of steps leads from one time to the next.
       y0: the state at the first time, (number,), if it is known; None fits it.
       segments: how many; None takes 60, or fewer so that each has five samples.
+      guess: states to start from, (time, number), for numbers that were not observed at any time; of the others the
+        values are taken.
       sigma: the noise of the values, a number or (number,); None estimates it.
       bounds: of the parameters, as in `fit`.
       step: the method, as in `solve`.
@@ -122,12 +125,13 @@ def multiple_shooting(
     checks.increasing("times", t)
     number = _number_of_segments(segments, len(t))
     cut = Segments.of(len(t), number)
-    sigma, size = _noise(t, x, sigma)
+    filled = _filled(t, x, guess)
+    sigma, size = _noise(t, x, filled, sigma)
     first = None if y0 is None else checks.reals("y0", y0, f"numbers of shape ({x.shape[1]},)")
     if first is not None and first.shape != x.shape[1:]:
         raise ValueError(f"y0 must have shape {x.shape[1:]}, got {first.shape}")
     residual = Shooting(f, step, max(1, int(np.ceil(np.diff(t).max() / dt * (1 - 1e-9)))), first is not None)
-    starts = _filled(t, x)[cut.starts]
+    starts = filled[cut.starts]
     data = {
         "times": t[cut.rows],
         "values": np.where(np.isfinite(x), x, 0)[cut.rows],
@@ -190,9 +194,9 @@ def _number_of_segments(segments: int | None, samples: int) -> int:
     return number
 
 
-def _noise(t: np.ndarray, x: np.ndarray, sigma: Any) -> tuple[np.ndarray, np.ndarray]:
+def _noise(t: np.ndarray, x: np.ndarray, filled: np.ndarray, sigma: Any) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviation of the noise and of the motion, of each number."""
-    size = np.nanstd(x, axis=0)
+    size = np.std(filled, axis=0)
     size = np.where(size > 0, size, 1.0)
     if sigma is None:
         one = np.ones((len(t), 1))
@@ -204,12 +208,17 @@ def _noise(t: np.ndarray, x: np.ndarray, sigma: Any) -> tuple[np.ndarray, np.nda
     return np.broadcast_to(noise, size.shape), size
 
 
-def _filled(t: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Values with gaps filled by their neighbours in time."""
+def _filled(t: np.ndarray, x: np.ndarray, guess: Any) -> np.ndarray:
+    """Values with gaps filled by the guess, or by their neighbours in time."""
+    if guess is not None:
+        other = checks.reals("guess", guess, "numbers of shape (time, number)")
+        if other.shape != x.shape:
+            raise ValueError(f"guess must have shape {x.shape}, as values, got {other.shape}")
+        x = np.where(np.isfinite(x), x, other)
     columns = []
     for k, column in enumerate(x.T):
         seen = np.isfinite(column)
         if not seen.any():
-            raise ValueError(f"values must show each number of the state at some times, got only NaN in column {k}")
+            raise ValueError(f"values must show each number at some times, got only NaN in column {k}; give a guess=")
         columns.append(np.interp(t, t[seen], column[seen]))
     return np.stack(columns, axis=1)
