@@ -165,7 +165,10 @@ def test_a_solution_shows_span_steps_and_what_was_lost():
     lost = jax.vmap(lambda y: jeuler.solve(lambda t, y, args: y * y, y, dt=0.5, num_steps=20))(jnp.array([0.0, 1.0]))
     rows = dict(rows_of(lost._repr_html_()))
     assert rows["saved"] == "21 states of each of 2 runs"
-    assert rows["finite"] == f"1 of 2 runs are lost; the first step that is not finite is {lost.first_nonfinite.max()}"
+    assert (
+        rows["finite"]
+        == f"1 of 2 runs are not finite to the end; the first step that is not finite is {lost.first_nonfinite.max()}"
+    )
 
 
 def test_a_pool_shows_missed_births():

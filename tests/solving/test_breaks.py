@@ -115,6 +115,15 @@ def test_a_break_gives_fixed_steps_their_order_back(step, time):
     assert np.log2(error(40) / error(160)) / 2 == pytest.approx(order, abs=0.25)
 
 
+def test_a_jump_at_the_end_must_be_named_too():
+    field = lambda t, y, args: jnp.where(t < 1.0, 1.0, 5.0)  # noqa: E731
+    ends = [
+        float(jeuler.solve(field, 0.0, dt=0.5, num_steps=2, step=jeuler.heun_step, breaks=breaks).y[-1])
+        for breaks in ((), (1.0,))
+    ]
+    assert ends == [2.0, 1.0]
+
+
 def test_breaks_stop_adaptive_steps_without_a_rejection():
     run = jeuler.solve_adaptive(switched, 1.0, t1=[0.5, 1.0, 2.0], args=0.8, rtol=1e-8, breaks=[0.8, 7.0])
     np.testing.assert_allclose(run.y, np.exp(-RATE * np.minimum([0, 0.5, 1.0, 2.0], 0.8)), rtol=1e-7)

@@ -141,7 +141,7 @@ def advise_step(
         most=max_pilot_steps,
         breaks=asked.breaks,
     )
-    advice = _Words(search).advice()
+    advice = _Answer(search).advice()
     return dataclasses.replace(advice, reason=advice.reason + asked.left_out)
 
 
@@ -150,8 +150,8 @@ def is_explicit(step: Any) -> bool:
     return hasattr(getattr(step, "base", step), "increment")
 
 
-class _Words:
-    """What a search found, as an answer or a refusal with its reason."""
+class _Answer:
+    """Makes the `StepAdvice` of a search: an answer or a refusal, with its reason."""
 
     def __init__(self, search: Search) -> None:
         self.search = search
@@ -161,7 +161,9 @@ class _Words:
     def advice(self) -> StepAdvice:
         search = self.search
         if not search.bound > 0:
-            return self.refusal(f"{self.name} lets an oscillation grow at any dt, beyond use at t1; use rk4_step")
+            return self.refusal(
+                f"{self.name} makes an oscillation grow at every dt, too far for any use at t1; use rk4_step"
+            )
         start = 16
         while start * search.bound < search.interval and 2 * start <= search.most:
             start *= 2
@@ -180,19 +182,19 @@ class _Words:
         search, most = self.search, f"{self.search.most:,} steps"
         if ladder is not None:
             return (
-                f"the error of {self.name} does not fall evenly with dt (f may jump), and no run of at most {most} "
-                f"was seen to meet the target"
+                f"the error of {self.name} does not fall evenly with dt (f may jump), and no run of up to {most} "
+                f"met the target"
             )
         if search.bound * search.most < 2 * search.interval:
-            return f"{self.needs()}, more than pilot runs of at most {most} can look into"
+            return f"{self.needs()}, more than the longest pilot run, {most}, can check"
         if search.bound * search.most < 16 * search.interval:
-            return f"{self.needs()}, and no pilot run of at most {most} was seen to meet the target"
-        return f"the error of {self.name} did not fall as its order says within {most}, so none can be predicted"
+            return f"{self.needs()}, and no pilot run of up to {most} met the target"
+        return f"within {most} the error of {self.name} did not begin to fall with its order, so no dt can be predicted"
 
     def remedy(self) -> str:
         """What meets the target instead: an adaptive run that was made."""
         if self.search.reference is None:
-            return "; no adaptive run was seen to meet it either; raise max_pilot_steps, or take a shorter interval"
+            return "; no adaptive run is known to meet it either; raise max_pilot_steps, or take a shorter interval"
         words = f"; use {self.search.reference.words}, whose run is known to meet the target"
         fewer = self.search.implicit_steps(self.search.reference.final, 4096) if is_explicit(self.search.step) else None
         return words + (f", or {fewer:,} step{'s' * (fewer > 1)} of linearly_implicit_euler_step" if fewer else "")

@@ -24,7 +24,8 @@ class Asked:
       f, y0, t0, t1, args: the equation and its interval.
       error, relative: the target.
       breaks: those from t0 to t1, s.
-      scene: whether a scene was given.  left_out: words on its effects that are not in the equation, or none.
+      name: how the line that makes a run writes the scene, without effects that are left out; "" without a scene.
+      left_out: words on effects that are not in the equation, or none.
     """
 
     f: VectorField
@@ -35,7 +36,7 @@ class Asked:
     error: float
     relative: bool
     breaks: tuple[float, ...]
-    scene: bool
+    name: str
     left_out: str
 
     @classmethod
@@ -43,10 +44,11 @@ class Asked:
         cls, who: str, f: Any, y0: Any, *, t0: Any, t1: Any, args: Any, error: Any, relative: Any, breaks: Any
     ) -> Asked:
         """From what the user passes to ``who``, or one ValueError."""
-        is_scene, left_out = isinstance(f, Scene), ""
-        if is_scene:
+        name, left_out = "", ""
+        if isinstance(f, Scene):
             effects = effects_left_out(f)
             left_out = f"; without {', '.join(effects)}, which pilot runs leave out" if effects else ""
+            name = "scene.without_effects()" if effects else "scene"
             (y0, args), f = f.as_equation(y0), f.without_effects().vector_field
         y0 = checks.state("y0", y0)
         checks.untraced(who, y0, args, t0, t1, error)
@@ -57,4 +59,4 @@ class Asked:
         checks.vector_field(f, t0, y0, args)
         checks.true_or_false("relative", relative)
         within = tuple(float(b) for b in np.asarray(checked_breaks(breaks, float)) if t0 <= float(b) <= t1)
-        return cls(f, y0, t0, t1, args, float(error), relative, within, is_scene, left_out)
+        return cls(f, y0, t0, t1, args, float(error), relative, within, name, left_out)

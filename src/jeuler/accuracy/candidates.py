@@ -13,6 +13,7 @@ import numpy as np
 from jeuler._core import trees
 from jeuler._core.precision import double_precision
 from jeuler.accuracy.method import has_diffrax, is_diffrax
+from jeuler.accuracy.runs import by_diffrax
 from jeuler.solving._adaptive import solve_adaptive
 from jeuler.solving._scan import solve, solve_to
 from jeuler.steps.explicit import (
@@ -243,22 +244,8 @@ def _adaptive(candidate: Candidate, problem: Problem) -> Any:
 
 
 def _solved(candidate, problem, y0, args, t0, t1, dt0, controller, most):
-    import diffrax
-
-    run = diffrax.diffeqsolve(
-        diffrax.ODETerm(problem.f),
-        candidate.step,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        stepsize_controller=controller,
-        max_steps=most,
-        throw=False,
-    )
-    reached = run.result == diffrax.RESULTS.successful
-    return jax.tree.map(lambda leaf: jnp.where(reached, leaf[-1], jnp.nan), run.ys), run.stats["num_steps"]
+    states, failed, num_steps = by_diffrax(problem.f, y0, args, candidate.step, t0, t1, dt0, controller, most)
+    return jax.tree.map(lambda leaf: jnp.where(failed < 0, leaf[-1], jnp.nan), states), num_steps
 
 
 def explicit_reference() -> Candidate:

@@ -203,7 +203,7 @@ def advise_method(
     )
     absent = methods is None and not has_diffrax()
     left_out = asked.left_out + ("; diffrax is not installed, so without its solvers" if absent else "")
-    ranking = _Ranking(problem, asked.error, relative, begun + float(patience), asked.scene)
+    ranking = _Ranking(problem, asked.error, relative, begun + float(patience), asked.name)
     return ranking.advice(candidates, begun, left_out)
 
 
@@ -226,7 +226,7 @@ def _checked(methods: Any) -> Mapping[str, Any]:
 class _Ranking:
     """Trials of the candidates on one problem."""
 
-    def __init__(self, problem: Problem, error: float, relative: bool, until: float, scene: bool) -> None:
+    def __init__(self, problem: Problem, error: float, relative: bool, until: float, scene: str) -> None:
         self.problem, self.error, self.relative = problem, error, relative
         self.until, self.scene, self.size = until, scene, 1.0
         self.stiff = False

@@ -7,15 +7,16 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jeuler._core.component import Function
 from jeuler._core.precision import cast, flat_rows, precision
 from jeuler._jax import programs
-from jeuler.solving._breaks import checked_breaks, split_at
-from jeuler.solving._scan import advance_by, no_remainder
+from jeuler.solving._breaks import checked_breaks
+from jeuler.solving._scan import solve_to
 from jeuler.steps.explicit import Step, VectorField
 
 PyTree = Any
@@ -67,20 +68,18 @@ def _pilot_run(
     compensated: bool,
 ) -> PyTree:
     """The states after these numbers of steps."""
-    advance = advance_by(step, compensated=compensated)
-    if breaks is not None:
-        advance = split_at(advance, breaks)
-
-    def one_step(n, state):
-        return advance(f, t0 + n.astype(dt.dtype) * dt, state, dt, args)
-
-    def segment(carry, end):
-        begin, state = carry
-        state = lax.fori_loop(begin, end, one_step, state)
-        return (end, state), state[0]
-
-    start = jnp.int32(0), (y0, no_remainder(y0, compensated))
-    return lax.scan(segment, start, ends)[1]
+    states, _ = solve_to(
+        f,
+        y0,
+        dt=dt,
+        ends=ends,
+        t0=t0,
+        args=args,
+        step=step,
+        compensated=compensated,
+        breaks=() if breaks is None else breaks,
+    )
+    return jax.tree.map(lambda leaf: leaf[1:], states)
 
 
 @dataclasses.dataclass
@@ -118,7 +117,7 @@ class Ladder:
             column = finer
 
     def error_of(self, final: np.ndarray) -> float:
-        """Norm of a final state's difference from the extrapolated one; inf where either is lost."""
+        """Norm of a final state's difference from the extrapolated one; inf where either is not finite."""
         error = np.inf if self.best is None else distance(final, self.best)
         return error if np.isfinite(error) else np.inf
 
@@ -133,6 +132,6 @@ class Ladder:
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Euclidean norm of the difference of two states; inf or NaN, without a warning, where one is lost."""
+    """Euclidean norm of the difference of two states; inf or NaN, without a warning, where one is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.linalg.norm(a - b))

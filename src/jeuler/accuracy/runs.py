@@ -169,19 +169,32 @@ def final_state(method: Method, run: FixedRun | AdaptiveRun, f: VectorField, t0:
 def _diffrax(f, y0, args, solver, times, dt0, controller, most, adjoint):
     import diffrax
 
+    options = {"saveat": diffrax.SaveAt(ts=times)} | ({} if adjoint is None else {"adjoint": adjoint})
+    dt0 = None if dt0 is None else jnp.asarray(dt0, times.dtype)
+    return by_diffrax(f, y0, args, solver, times[0], times[-1], dt0, controller, most, **options)
+
+
+def by_diffrax(
+    f: VectorField,
+    y0: PyTree,
+    args: PyTree,
+    solver: Any,
+    t0: jax.Array,
+    t1: jax.Array,
+    dt0: jax.Array | None,
+    controller: Any,
+    most: int | None,
+    **options: Any,
+) -> tuple[PyTree, jax.Array, jax.Array]:
+    """A run of a diffrax solver: states with a leading axis, the last one alone where options ask for no other.
+
+    After these: -1, or the steps after which it failed; and the steps taken.
+    """
+    import diffrax
+
+    term = diffrax.ODETerm(f)
     run = diffrax.diffeqsolve(
-        diffrax.ODETerm(f),
-        solver,
-        times[0],
-        times[-1],
-        None if dt0 is None else jnp.asarray(dt0, times.dtype),
-        y0,
-        args,
-        saveat=diffrax.SaveAt(ts=times),
-        stepsize_controller=controller,
-        max_steps=most,
-        throw=False,
-        **({} if adjoint is None else {"adjoint": adjoint}),
+        term, solver, t0, t1, dt0, y0, args, stepsize_controller=controller, max_steps=most, throw=False, **options
     )
     failed = jnp.where(run.result == diffrax.RESULTS.successful, -1, run.stats["num_steps"])
     return run.ys, failed, run.stats["num_steps"]

@@ -289,7 +289,7 @@ class Search:
         return num_steps, error_of(num_steps) * self.error * self.scale(final)
 
     def error_after(self, num_steps: int, final: np.ndarray) -> float:
-        """Error of a run in terms of the target; inf where it is lost."""
+        """Error of a run in terms of the target; inf where it is not finite."""
         error = distance(self.pilot(num_steps)[-1], final) / self.scale(final) / self.error
         return error if math.isfinite(error) else math.inf
 

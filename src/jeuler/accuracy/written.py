@@ -10,14 +10,14 @@ from jeuler.accuracy.method import is_diffrax
 MOST_OURS, MOST_DIFFRAX = 16_384, 4096  # max_steps of solve_adaptive and diffeqsolve where nothing is said
 
 
-def code_of(candidate: Candidate, problem: Problem, setting: Any, num_steps: int, *, scene: bool) -> str:
-    """The line for a setting: a number of steps, or (rtol, atol). For a scene: of `scene` and `state`.
+def code_of(candidate: Candidate, problem: Problem, setting: Any, num_steps: int, *, scene: str) -> str:
+    """The line for a setting: a number of steps, or (rtol, atol). For a scene, as ``scene`` names it, and `state`.
 
     It keeps the last state only, as the runs that were timed do.
     """
     field, state, args = "f", "y0", "" if problem.args is None else "args"
     if scene:
-        field, state, args = "scene.vector_field", "scene.as_equation(state)[0]", "scene.attributes(state)"
+        field, state, args = f"{scene}.vector_field", f"{scene}.as_equation(state)[0]", f"{scene}.attributes(state)"
     if is_diffrax(candidate.step):
         return _diffrax(candidate, problem, setting, num_steps, field, f"{state}, {args}" if args else state)
     start = "" if problem.t0 == 0 else f"t0={problem.t0!r}, "
@@ -29,7 +29,7 @@ def code_of(candidate: Candidate, problem: Problem, setting: Any, num_steps: int
         return f"jeuler.solve_adaptive({field}, {state}, {end}{step}{most}{others})"
     grid = f"{start}dt={(problem.t1 - problem.t0) / setting!r}, num_steps={setting}, save_every={setting}"
     if scene and not problem.breaks:
-        return f"jeuler.simulate(scene, state, {grid}{step})"
+        return f"jeuler.simulate({scene}, state, {grid}{step})"
     return f"jeuler.solve({field}, {state}, {grid}{step}{others})"
 
 

@@ -120,7 +120,8 @@ def solve(
       compensated: accumulate y by compensated (Kahan-Neumaier) sums: the roundoff of a long run stays near one unit
         in the last place instead of growing with the number of steps. Explicit steps only.
       breaks: times at which f may jump, (break,), s: the step that a break falls into ends there and goes on from it,
-        and f is evaluated just before and just after. Differentiable.
+        and f is evaluated just before and just after. A jump at the last time must be named too, or the last step
+        sees f after it. Differentiable.
       progress: True shows a bar with an estimate of the end; a function is called as ``progress(step, num_steps)``
         about ten times a second, and what it raises ends the run. Not under jit, vmap or grad, nor with "reversible".
     Returns: `Solution`, saved states with leading axis num_steps // save_every + 1, initial value first.

@@ -1,4 +1,4 @@
-"""Solutions as tables for a notebook: the span, the steps, and what was lost."""
+"""Solutions as tables for a notebook: the span, the steps, and what it could not do."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def nonfinite_in_words(first_nonfinite: Any) -> str:
     if not lost.size:
         return "every step"
     first = f"the first step that is not finite is {lost.min()}"
-    return first if steps.ndim == 0 else f"{lost.size} of {steps.size} runs are lost; {first}"
+    return first if steps.ndim == 0 else f"{lost.size} of {steps.size} runs are not finite to the end; {first}"
 
 
 def losses(solution: Any) -> list[tuple[str, str]]:
