@@ -1,7 +1,7 @@
 """Fits of springs: nets of many springs, a chain beside mujoco.sysid, coverage of errors, starts that are wrong.
 
     python benchmarks/fits.py net [particles]      about 6 springs a particle, a decade of ks and kd, 0.1 % noise
-    python benchmarks/fits.py cloth [side]         the cloth of 70 by 70 particles, 28,564 springs
+    python benchmarks/fits.py cloth [side]         the cloth of 70 by 70 particles, 28,565 springs
     python benchmarks/fits.py chain [N ...]        time from data to answer of a chain of N masses, N + 1 springs
     python benchmarks/fits.py coverage             how often nominal 95 % intervals hold the truth, 500 records each
     python benchmarks/fits.py starts [cases]       one oscillator, starts wrong by up to 100, and aliased tenfold
