@@ -3,6 +3,8 @@
     python benchmarks/first_answer.py             a table; about ten minutes on two cores
     python benchmarks/first_answer.py solve fit   these rows alone
 
+jax-md's bonds have no dampers: less work. Fits beside mujoco.sysid: `python benchmarks/fits_mujoco.py 3`.
+
 Each figure is of processes of their own, medians of `ROUNDS`: seconds by the clock, seconds of CPU, programs compiled.
 """
 
@@ -42,6 +44,16 @@ def run(ks):
     scene = jeuler.Scene((jeuler.Gravity([0., 0., -9.81]), jeuler.Springs(edges, ks, 0.1, 1.0)))
     return jeuler.simulate(scene, state, dt=1e-3, num_steps=100, save_every=100).y.position[-1]
 """
+JAX_MD = """
+from jax_md import energy, space
+displacement, shift = space.free()
+def run(ks):
+    bonds = lambda x: energy.simple_spring_bond(displacement, jnp.asarray(edges), length=1., epsilon=ks, alpha=2.)(x)
+    def step(y, _):
+        x, v = y
+        return (shift(x, 1e-3 * v), v - 1e-3 * (jax.grad(bonds)(x) + jnp.array([0., 0., 9.81]))), None
+    return jax.lax.scan(step, (state.position, state.velocity), None, length=100)[0][0]
+"""
 DECAY = """
 import numpy as np
 times = np.arange(50) * 0.1
@@ -65,6 +77,8 @@ ROWS = {
     "solve, diffrax": FIELD + DIFFRAX,
     "simulate": FIELD + CLOTH + "print(run(1000.)[0])",
     "gradient": FIELD + CLOTH + "print(jax.grad(lambda ks: jnp.sum(run(ks) ** 2))(1000.))",
+    "simulate, jax-md": FIELD + CLOTH + JAX_MD + "print(run(1000.)[0])",
+    "gradient, jax-md": FIELD + CLOTH + JAX_MD + "print(jax.grad(lambda ks: jnp.sum(run(ks) ** 2))(1000.))",
     "fit": FIELD + DECAY + FIT,
     "fit, SciPy": DECAY + SCIPY,
     "command line": "import sys\nsys.argv = ['jeuler', 'fit', '--plot', 'out.png']\n"
@@ -103,6 +117,6 @@ def row(name: str) -> str:
 if __name__ == "__main__":
     print("| | empty cache, s | of CPU | warm cache, s | of CPU | programs |\n|---|--:|--:|--:|--:|--:|")
     for name in sys.argv[1:] or ROWS:
-        needs = {"solve, diffrax": "diffrax"}.get(name)
+        needs = {"diffrax": "diffrax", "jax-md": "jax_md", "SciPy": "scipy"}.get(name.rpartition(", ")[2])
         if needs is None or importlib.util.find_spec(needs):
             print(row(name), flush=True)

@@ -33,10 +33,30 @@ def births(k):
     return jeuler.simulate(scene, jeuler.empty_pool(8, 2), key=jax.random.key(0), **GRID).y.position.sum()
 
 
+def adaptive(k):
+    return jeuler.solve_adaptive(lambda t, y, k: -k * y, jnp.ones(3), t1=0.1, args=k, rtol=1e-3, atol=1e-3).y.sum()
+
+
 @pytest.mark.parametrize("function", [solved, springs, collisions, births])
 def test_runs_and_gradients_lower_for_accelerators(function):
     run = jax.jit(jax.value_and_grad(function))
     exported = jax.export.export(run, platforms=["cuda", "rocm", "tpu"])(jnp.float32(1.0))
+    assert set(exported.platforms) == {"cuda", "rocm", "tpu"}
+
+
+def fitted(data):
+    """A whole fit, its search included, as a part of a program."""
+
+    def residual(params):
+        run = jeuler.solve(lambda t, y, k: -k * y, jnp.ones(()), dt=0.1, num_steps=9, args=params["k"])
+        return run.y - data
+
+    return jeuler.fit(residual, {"k": jnp.float32(1.0)}, max_iterations=5).params["k"]
+
+
+@pytest.mark.parametrize(("function", "argument"), [(adaptive, jnp.float32(1.0)), (fitted, jnp.ones(10, jnp.float32))])
+def test_adaptive_runs_and_fits_lower_for_accelerators(function, argument):
+    exported = jax.export.export(jax.jit(function), platforms=["cuda", "rocm", "tpu"])(argument)
     assert set(exported.platforms) == {"cuda", "rocm", "tpu"}
 
 
