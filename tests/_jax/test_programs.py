@@ -113,6 +113,20 @@ def test_the_second_call_compiles_nothing(name):
             np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+def test_a_second_advice_or_diagnosis_of_the_same_equations_compiles_nothing():
+    def advised(k):
+        return jnp.asarray(jeuler.advise_step(lambda t, y, args: -k * y, 1.0, t1=1.0, error=1e-2).dt)
+
+    def diagnosed(ks):
+        found = jeuler.diagnose(scene(ks), STATE, dt=0.01, num_steps=3, loss=lambda s: jnp.sum(s.position**2))
+        return jnp.asarray(found.finite)
+
+    for run in (advised, diagnosed):
+        first, second = compilations(run, (1.0,), (1.0,))
+        assert first > 0
+        assert second == 0
+
+
 def test_programs_are_of_each_precision_shape_and_count():
     f = lambda t, y, args: -y  # noqa: E731
     assert end(f, np.float32(1)).dtype == np.float32
