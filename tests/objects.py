@@ -32,6 +32,22 @@ def spring_fit():
     return jeuler.fit_springs(scene, state, times, positions, **options)
 
 
+def found_springs():
+    times = np.linspace(0.0, 6.0, 121)
+    swing = 0.5 + 0.1 * np.cos(4.0 * times)  # two masses of 1 kg, ks = 8 N/m, rest length 1 m
+    return jeuler.find_springs(times, np.stack([-swing, swing], axis=1)[:, :, None], mass=1.0, refine=False)
+
+
+def shooting_fit():
+    times = np.linspace(0.0, 10.0, 51)
+    values = np.exp(-0.5 * times)[:, None]
+    return jeuler.multiple_shooting(shrinking, jnp.asarray(2.0), times, values, dt=0.1, segments=2)
+
+
+def shrinking(t, y, rate):
+    return -rate * y
+
+
 def trajectory():
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "swing.csv"
@@ -65,6 +81,8 @@ RESULTS = {
     "AdaptiveSolution": lambda: jeuler.solve_adaptive(decay, 1.0, t1=1.0, rtol=1e-3, max_steps=16),
     "Fit": lambda: jeuler.fit(line, {"slope": 1.0, "unused": 2.0}, max_iterations=3),
     "SpringFit": spring_fit,
+    "FoundSprings": found_springs,
+    "ShootingFit": shooting_fit,
     "Identifiability": lambda: jeuler.identifiability(*hanging(), np.linspace(0.0, 0.3, 7), ("ks",), dt=0.05),
     "Method": lambda: jeuler.Method(jeuler.rk4_step, dts=(0.1, 0.2), options={"breaks": (0.5,)}),
     "WorkPrecision": lambda: jeuler.work_precision(
