@@ -101,8 +101,9 @@ class Springs:
 
     def prepare(self, context: Any) -> PreparedSprings | None:
         """The springs between the living, laid out for the kernels; None where there are no springs."""
-        springs = self.laid_out(context.particles, context.dtype, context.limits_drag)
-        return springs.prepare(context) if len(self.edges) else None
+        if not len(self.edges):
+            return None
+        return self.laid_out(context.particles, context.dtype, context.limits_drag).prepare(context)
 
     def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedSprings:
         """The same force with its parameters in the slots of each layout, which is the same work at every step."""
