@@ -49,7 +49,7 @@ def constructor_says_what_to_write(cls: type) -> None:
                 raise
         raise ValueError(problem)
 
-    cls.__init__ = __init__  # type: ignore[misc]
+    cls.__init__ = __init__  # type: ignore[misc]  # as above
 
 
 def mistake(function: Callable, args: tuple, named: dict, instead: dict[str, str], name: str = "") -> str | None:

@@ -21,7 +21,7 @@ from jeuler._core.partition import OfArrays
 from jeuler.fitting.kept import Record
 from jeuler.fitting.least_squares import CONVERGED, NOT_FINITE, RUNNING, STALLED, Task, start
 from jeuler.fitting.losses import LOSSES
-from jeuler.fitting.minimise import Watch, progress_bar
+from jeuler.fitting.minimise import TUNING, Watch, progress_bar
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import FlatResidual, Problem
 from jeuler.fitting.report import NOT_FINITE as WITHOUT_A_START
@@ -139,7 +139,7 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
             f"starts must be None for {len(problem.x)} unknowns, got {options.starts!r}; start at one place"
         )
     task = problem.task(options.tolerance)
-    spread = options.loss_scale if options.loss_scale is not None else 1.345 * (known.noise or 1.0)
+    spread = options.loss_scale if options.loss_scale is not None else TUNING * (known.noise or 1.0)
     task = task._replace(spread=np.asarray(spread if options.loss != "linear" else 1.0))
     products, x, record = _products(problem.residual, options.loss), np.asarray(problem.x, float), None
     if options.resume is not None:
@@ -183,29 +183,17 @@ def descend(
     products: Products, point: Point, task: Task, most: int, stage: int, history: list[float], watch: Watch
 ) -> Point:
     """Damped steps to the minimum, or to what can be had of it."""
-    try:
-        if not np.isfinite(point.cost):
-            cost, total, r = (np.asarray(a, float) for a in products.cost(point.x, task))
-            point = point._replace(cost=cost, total=total, residual=r)
-            if not np.isfinite(cost):
-                return point._replace(nonfinite=point.nonfinite + 1, status=np.asarray(NOT_FINITE))
-        while point.status == RUNNING and point.iterations < most:
-            before = point.iterations
-            point = _iterate(products, point, task)
-            counted = bool(point.iterations > before)
-            history += [float(point.total)] * counted
-            watch.see(stage, point, history, counted)
-    except KeyboardInterrupt:
-        if np.isinf(point.cost):
-            raise
-        watch.interrupted = True
-    return point
+    if not np.isfinite(point.cost):
+        cost, total, r = (np.asarray(a, float) for a in products.cost(point.x, task))
+        point = point._replace(cost=cost, total=total, residual=r)
+        if not np.isfinite(cost):
+            return point._replace(nonfinite=point.nonfinite + 1, status=np.asarray(NOT_FINITE))
+    return watch.follow(lambda point: _iterate(products, point, task), point, most, stage, history)
 
 
 def _iterate(products: Products, point: Point, task: Task) -> Point:
     """One damped step, taken or not."""
     x, damping = point.x, point.damping
-
     step, decrease = (np.asarray(a, float) for a in products.step(x, task, damping))
     freedom = max(int(np.sum(task.weights > 0)) - len(x), 1)
     offset = np.sqrt(max(float(decrease), 0.0) / len(x) / (max(float(point.cost - decrease), 1e-300) / freedom))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,21 @@ class Watch:
     bar: Any
     record: Record | None = None
     interrupted: bool = False
+
+    def follow(self, advance: Callable[[Any], Any], state: Any, most: int, stage: int, history: list[float]) -> Any:
+        """One search to its end, or to where it is interrupted; ``advance`` makes one step of it, taken or not."""
+        try:
+            while state.status == least_squares.RUNNING and state.iterations < most:
+                before = state.iterations
+                state = advance(state)
+                counted = bool(state.iterations > before)
+                history += [float(state.total)] * counted
+                self.see(stage, state, history, counted)
+        except KeyboardInterrupt:
+            if np.isinf(state.cost):
+                raise
+            self.interrupted = True
+        return state
 
     def see(self, stage: int, state: Any, history: list[float], counted: bool) -> None:
         if counted:
@@ -100,20 +115,12 @@ def _through(
     evaluate: Evaluate, loss: Loss, state: State, task: Task, stage: int, history: list[float], watch: Watch
 ) -> State:
     """One search to its end."""
+
+    def advance(state: State) -> State:
+        return least_squares.advance(evaluate, loss, state, task, state.evaluations + 1)
+
     with np.errstate(all="ignore"):
-        while state.status == least_squares.RUNNING and state.iterations < len(state.history):
-            before = state.iterations
-            try:
-                state = least_squares.advance(evaluate, loss, state, task, state.evaluations + 1)
-                counted = bool(state.iterations > before)
-                history += [float(state.total)] * counted
-                watch.see(stage, state, history, counted)
-            except KeyboardInterrupt:
-                if np.isinf(state.cost):
-                    raise
-                watch.interrupted = True
-                break
-    return state
+        return watch.follow(advance, state, len(state.history), stage, history)
 
 
 def _spread_of(residual: np.ndarray, weights: np.ndarray) -> float:

@@ -99,7 +99,7 @@ class Places:
     def _picked(self, scene: Scene) -> Any:
         """What the function of the scene picks."""
         try:
-            picked = self.where(scene)  # type: ignore[misc]
+            picked = self.where(scene)  # type: ignore[misc]  # not None: read asks
         except (AttributeError, IndexError, TypeError) as error:
             raise ValueError(
                 f"where must be a function of the scene, such as lambda scene: scene.forces[1].ks; it fails: {error}"

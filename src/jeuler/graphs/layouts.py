@@ -26,6 +26,8 @@ from jeuler.graphs import incidence
 from jeuler.graphs.laplacian import laplacian, products
 
 Law = Callable[..., Array]  # (square, approach, *parameters) -> c, elementwise
+Components = Sequence[Array]  # one array (particle,) a component
+Slots = list[Array] | Array  # what `to_slots` makes of a parameter
 
 
 class Layout(abc.ABC):
@@ -40,12 +42,7 @@ class Layout(abc.ABC):
 
     @abc.abstractmethod
     def central_force(
-        self,
-        law: Law,
-        x: Sequence[Array],
-        v: Sequence[Array],
-        parameters: Sequence[list[Array] | Array],
-        read_again: bool = False,
+        self, law: Law, x: Components, v: Components, parameters: Sequence[Slots], read_again: bool = False
     ) -> list[Array]:
         """B^T (c B x) with c = law(|B x|^2, (B v).(B x), *parameters): (particle,) for each component of x.
 
@@ -53,14 +50,14 @@ class Layout(abc.ABC):
         that limits a quadratic drag.
         """
 
-    def to_slots(self, x: Array) -> list[Array] | Array:
+    def to_slots(self, x: Array) -> Slots:
         """A value of each edge, () or (edge,), as one array a group with 0 in empty slots, or what `by_group` takes."""
         if x.ndim == 0:
             return [x] * len(self.slot_edges)
         x = jnp.concatenate([x, jnp.zeros_like(x, shape=(1,))])  # slot -1 reads the zero at the end
         return [x[np.where(edges < 0, len(x) - 1, edges)] for edges in self.slot_edges]
 
-    def by_group(self, parameter: list[Array] | Array) -> list[Array]:
+    def by_group(self, parameter: Slots) -> list[Array]:
         """What `to_slots` made, as one array a group."""
         assert isinstance(parameter, list)
         return parameter
@@ -76,12 +73,7 @@ class Indexed(Layout):
     tables: tuple[np.ndarray, ...]
 
     def central_force(
-        self,
-        law: Law,
-        x: Sequence[Array],
-        v: Sequence[Array],
-        parameters: Sequence[list[Array] | Array],
-        read_again: bool = False,
+        self, law: Law, x: Components, v: Components, parameters: Sequence[Slots], read_again: bool = False
     ) -> list[Array]:
         # both ends read one slot: d is stored, its cotangent too, not computed again for either
         d = [stored(self.difference(component)) for component in x]
@@ -126,12 +118,7 @@ class Shifts(Layout):
         self.slot_edges: tuple[np.ndarray, ...] = tuple(groups)
 
     def central_force(
-        self,
-        law: Law,
-        x: Sequence[Array],
-        v: Sequence[Array],
-        parameters: Sequence[list[Array] | Array],
-        read_again: bool = False,
+        self, law: Law, x: Components, v: Components, parameters: Sequence[Slots], read_again: bool = False
     ) -> list[Array]:
         x, v = ([kept(component) for component in y] for y in (x, v))
         squares, approaches = (self.dot_differences(y, x) for y in (x, v))
@@ -146,10 +133,10 @@ class Shifts(Layout):
         by_component = (products(a, b, self.offsets) for a, b in zip(x, y, strict=True))
         return [total(group) for group in zip(*by_component, strict=True)]
 
-    def to_slots(self, x: Array) -> list[Array] | Array:
+    def to_slots(self, x: Array) -> Slots:
         return jnp.broadcast_to(x, self.particles + max(self.offsets)) if x.ndim == 0 else super().to_slots(x)
 
-    def by_group(self, parameter: list[Array] | Array) -> list[Array]:
+    def by_group(self, parameter: Slots) -> list[Array]:
         if isinstance(parameter, list):
             return parameter
         return [parameter[: self.particles + k] for k in self.offsets]

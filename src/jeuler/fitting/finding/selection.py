@@ -98,6 +98,11 @@ def _select(normal: Normal, terms: tuple[bool, bool, bool], alpha: float, begin:
     return _Fit(normal, use, sorted(chosen)).selection(terms, limit)
 
 
+def _terms_of(pairs: np.ndarray, each: int, use: np.ndarray) -> np.ndarray:
+    """Indices of the terms ``use`` of these pairs, where each pair has so many."""
+    return (each * pairs[:, None] + use).ravel()
+
+
 def _not_negative(normal: Normal, use: np.ndarray, count: int) -> list[int]:
     """The pairs that non-negative least squares over all of them leaves in.
 
@@ -106,7 +111,7 @@ def _not_negative(normal: Normal, use: np.ndarray, count: int) -> list[int]:
     """
     from scipy.optimize import nnls
 
-    index = (len(TERMS) * np.arange(count)[:, None] + use).ravel()
+    index = _terms_of(np.arange(count), len(TERMS), use)
     gram = normal.gram[index][:, index].toarray()
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
@@ -154,7 +159,7 @@ class _Rest:
 
     def __init__(self, normal: Normal, use: np.ndarray) -> None:
         size, count = len(use), normal.gram.shape[0] // len(TERMS)
-        index = (len(TERMS) * np.arange(count)[:, None] + use).ravel()
+        index = _terms_of(np.arange(count), len(TERMS), use)
         self.gram = normal.gram[index][:, index].tocsr()
         self.slope = normal.slope[index].reshape(count, size).copy()
         self.own = _diagonal_blocks(self.gram, count, size)
@@ -168,7 +173,7 @@ class _Rest:
         if not pairs:
             return
         size = self.slope.shape[1]
-        columns = (size * np.asarray(pairs)[:, None] + np.arange(size)).ravel()
+        columns = _terms_of(np.asarray(pairs), size, np.arange(size))
         before = self.basis[: self.used]
         across = self.gram[columns].toarray() - before[:, columns].T @ before
         root = _root(across[:, columns], self.own[pairs])
@@ -238,7 +243,7 @@ class _Fit:
 
     def __init__(self, normal: Normal, use: np.ndarray, chosen: list[int], inverse: np.ndarray | None = None) -> None:
         self.normal, self.use, self.chosen = normal, use, np.asarray(chosen, int)
-        index = (len(TERMS) * self.chosen[:, None] + use).ravel()
+        index = _terms_of(self.chosen, len(TERMS), use)
         self.gram = normal.gram[index][:, index].toarray()
         slope = normal.slope[index]
         self.scale = np.sqrt(np.maximum(np.diag(self.gram), 1e-300))
@@ -309,9 +314,9 @@ class _Fit:
     def _least_seen(self, limit: float) -> np.ndarray:
         """(root of the limit + 1.645) standard errors of ks, each candidate added to what was chosen."""
         count, size = self.normal.gram.shape[0] // len(TERMS), len(self.use)
-        index = (len(TERMS) * np.arange(count)[:, None] + self.use).ravel()
+        index = _terms_of(np.arange(count), len(TERMS), self.use)
         gram = self.normal.gram[index][:, index].tocsr()
-        across = gram[:, (size * self.chosen[:, None] + np.arange(size)).ravel()[self.free]].toarray()
+        across = gram[:, _terms_of(self.chosen, size, np.arange(size))[self.free]].toarray()
         own = _diagonal_blocks(gram, count, size)
         values, vectors = np.linalg.eigh(self.inverse) if len(self.free) else (np.zeros(0), np.zeros((0, 0)))
         root = (vectors * np.sqrt(np.maximum(values, 0))).T / self.scale[self.free]
