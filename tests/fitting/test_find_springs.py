@@ -155,6 +155,8 @@ def test_the_fit_of_the_whole_motion_refines(net):
         ({"false_positives": 2.0}, "false_positives must be a chance"),
         ({"refine": 1}, "refine"),
         ({"positions": np.zeros((401, 7))}, "positions must have shape"),
+        ({"positions": np.ones((401, 7, 2))}, "positions must show a motion"),
+        ({"positions": np.zeros((401, 7, 2)) + np.arange(7.0)[:, None]}, "positions must show a motion"),
         ({"times": TIMES[:8], "positions": np.ones((8, 7, 2))}, "times must be 9 or more"),
     ],
 )

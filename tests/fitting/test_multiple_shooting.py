@@ -72,6 +72,9 @@ def test_a_model_that_is_wrong_leaves_gaps_or_misfit_and_says_so():
         ({"segments": 321}, "segments must be at most"),
         ({"sigma": -1.0}, "sigma must be above 0"),
         ({"dt": 0.0}, "dt must be greater than 0"),
+        ({"values": np.ones((320, 3))}, "values must have a row for each of the 321 times"),
+        ({"values": np.full((321, 3), np.nan)}, "values must have at least one finite value"),
+        ({"values": np.full((321, 3), np.inf)}, "values must be finite, or NaN"),
     ],
 )
 def test_wrong_input_is_one_line(record, change, expected):
@@ -79,3 +82,19 @@ def test_wrong_input_is_one_line(record, change, expected):
     with pytest.raises(ValueError, match=expected) as error:
         fitted(change.pop("values"), **change)
     assert "\n" not in str(error.value)
+
+
+def test_a_field_of_another_shape_is_refused():
+    values = np.ones((5, 2)) + np.arange(5)[:, None]
+    with pytest.raises(ValueError, match="must keep the shape"):
+        jeuler.multiple_shooting(lambda t, y, p: jnp.zeros(3), 1.0, np.arange(5.0), values, dt=0.1)
+
+
+def test_a_pair_of_bounds_is_of_the_parameters_and_not_of_the_states():
+    t = np.linspace(0.0, 4.0, 41)
+    found = jeuler.multiple_shooting(
+        lambda t, y, p: -p * y, jnp.asarray(2.0), t, -np.exp(-0.5 * t)[:, None], dt=0.1, segments=4, bounds=(0.0, 3.0)
+    )
+    np.testing.assert_allclose(found.params, 0.5, rtol=1e-4)
+    assert (found.starts < 0).all()
+    assert found.converged

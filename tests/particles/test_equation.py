@@ -278,6 +278,24 @@ def test_where_the_limit_does_not_bind_the_run_is_the_plain_one_to_the_last_bit(
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.parametrize("drags", [(), (jeuler.LinearDrag(0.1),)])
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.symplectic_euler_step, jeuler.rk4_step, None])
+def test_a_force_is_told_whether_drags_are_limited(drags, step):
+    told = []
+
+    class Asks:
+        def prepare(self, context):
+            told.append(context.limits_drag)
+            return lambda t, position, velocity, mass: -position
+
+        def __call__(self, t, position, velocity, mass):
+            return -position
+
+    context = Context(4, jnp.float64, None if step is None else jnp.asarray(0.1), step)
+    Equation.of((Asks(), *drags), (), context)
+    assert told == [bool(drags) and step in (jeuler.euler_step, jeuler.symplectic_euler_step)]
+
+
 @pytest.mark.parametrize("name", DRAGS)
 @pytest.mark.parametrize("c", [1e-3, 50.0])
 def test_gradients_through_the_limit(name, c):

@@ -120,12 +120,14 @@ def multiple_shooting(
     if x.ndim != 2 or not x.shape[1]:
         raise ValueError(f"values must have shape (time, number), got {x.shape}; one number is values[:, None]")
     t = checks.reals("times", times, "numbers of shape (time,), s")
-    t, cube = checked_observations(t, x[:, None, :], (1, x.shape[1]), float(np.min(t)) if t.size else 0.0)
-    x = cube[:, 0]
+    if t.ndim == 1 and len(t) != len(x):
+        raise ValueError(f"values must have a row for each of the {len(t)} times, got {x.shape}")
+    t, x = checked_observations(t, x, x.shape[1:], float(np.min(t)) if t.size else 0.0, "values")
     checks.increasing("times", t)
     number = _number_of_segments(segments, len(t))
     cut = Segments.of(len(t), number)
     filled = _filled(t, x, guess)
+    checks.vector_field(f, t[0], jnp.asarray(filled[0]), params)
     sigma, size = _noise(t, x, filled, sigma)
     first = None if y0 is None else checks.reals("y0", y0, f"numbers of shape ({x.shape[1]},)")
     if first is not None and first.shape != x.shape[1:]:
@@ -142,7 +144,7 @@ def multiple_shooting(
         "weight": np.asarray(0.0),
     }
     unknowns = {"params": params, "starts": jnp.asarray(starts if first is None else starts[1:])}
-    bounds = None if bounds is None else {"params": bounds} if isinstance(bounds, dict) else bounds
+    bounds = None if bounds is None else {"params": bounds}
     return _closed(residual, unknowns, data, cut, t, bounds, max_iterations)
 
 
@@ -169,6 +171,7 @@ def _closed(
     closed = stages[-1][1] < CLOSED
     state = "closed" if closed else "not closed"
     words = [f"the gaps between {len(starts)} segments are {state}: at most {stages[-1][1]:.2g} of the motion"]
+    words = words if len(starts) > 1 else ["one segment"]
     if not closed:
         words.append("the equations do not describe the record throughout, or more segments are needed")
     return ShootingFit(

@@ -10,8 +10,10 @@ import numpy as np
 from jeuler._core import checks
 
 
-def checked_observations(times: Any, positions: Any, shape: tuple[int, ...], t0: float) -> tuple[np.ndarray, Any]:
-    """Times and targets as float64 NumPy arrays, checked."""
+def checked_observations(
+    times: Any, positions: Any, shape: tuple[int, ...], t0: float, name: str = "positions"
+) -> tuple[np.ndarray, Any]:
+    """Times and targets as float64 NumPy arrays, checked; ``name`` is what the user calls the targets."""
     times = checks.reals("times", times, "numbers of shape (time,), s")
     targets: Any = checks.reals("positions", positions, "numbers of shape (time, particle, dim), m")
     if times.ndim != 1 or not len(times):
@@ -36,9 +38,9 @@ def checked_observations(times: Any, positions: Any, shape: tuple[int, ...], t0:
     if checks.is_traced(targets):
         return times, targets
     if np.isinf(targets).any():
-        raise ValueError("positions must be finite, or NaN where not observed, got inf")
+        raise ValueError(f"{name} must be finite, or NaN where not observed, got inf")
     if not np.isfinite(targets).any():
-        raise ValueError("positions must have at least one finite value, got none: nothing was observed")
+        raise ValueError(f"{name} must have at least one finite value, got none: nothing was observed")
     return times, targets
 
 

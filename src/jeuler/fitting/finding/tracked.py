@@ -53,13 +53,16 @@ class Tracked:
         m = _masses(mass, x.shape[1])
         x = _held_in_place(x, m)
         often = np.isfinite(x).all(axis=2).sum(axis=0) >= FEWEST
+        moving = often & np.isfinite(m)
+        if moving.any() and _size(x[:, moving]) == 0:
+            raise ValueError("positions must show a motion, got particles at rest, in which no spring shows")
         if sigma is None:
             flat = x.reshape(len(t), -1)
             sigma = max(noise_of(t, flat, np.ones_like(flat)) or 0.0, LEAST_NOISE * _size(x))
         else:
             checks.positive("sigma", sigma, "m")
         motion = Motion.of(t, x, float(sigma))
-        if motion is None or not (often & np.isfinite(m)).any():
+        if motion is None or not moving.any():
             raise ValueError(f"times must be {FEWEST} or more at which a particle is seen, got {len(t)} in all")
         pairs, nearest = _candidates(candidates, x, m, often)
         return cls(t, x, m, pairs, _forces(forces), motion, tuple(np.flatnonzero(~often).tolist()), nearest)
