@@ -29,8 +29,11 @@ class FixedCounter:
     """
 
     def __init__(self, method: Method, f: VectorField, y0: PyTree, args: PyTree, t0: float) -> None:
+        self.read: Callable[[], int]
+        self.program: Callable[..., Any]
         counted, self.read = counting(f)
-        self.inputs, self.most = (y0, args), MANY if method.iterates else FEW
+        self.inputs: tuple[PyTree, PyTree] = (y0, args)
+        self.most = MANY if method.iterates else FEW
         self.program = jax.jit(fixed_program(method, counted, t0, self.most))
 
     def first(self, run: FixedRun, num_steps: int) -> int:
@@ -65,11 +68,13 @@ class AdaptiveCounter:
     """Evaluations and accepted steps of the runs by tolerance of one method, each run counted whole."""
 
     def __init__(self, method: Method, f: VectorField, y0: PyTree, args: PyTree, times: np.ndarray) -> None:
+        self.read: Callable[[], int]
+        self.program: Callable[..., Any]
         counted, self.read = counting(f)
         self.record: list[tuple[float, np.ndarray]] = []
         if not is_diffrax(method.step):
             method = dataclasses.replace(method, step=Recorded(method.step, self.keep))
-        self.inputs = y0, args
+        self.inputs: tuple[PyTree, PyTree] = (y0, args)
         self.program = jax.jit(adaptive_program(method, counted, times))
 
     def keep(self, t: Any, y: Any) -> None:

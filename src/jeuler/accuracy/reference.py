@@ -24,7 +24,9 @@ class Norm:
     """A norm of the user's own, of a state or a difference of states given as its numbers."""
 
     def __init__(self, norm: Callable[[PyTree], Any], y0: PyTree) -> None:
-        self.norm, (vector, self.unflatten) = norm, trees.real_vector(y0)
+        self.norm: Callable[[PyTree], Any] = norm
+        self.unflatten: Callable[[Any], PyTree]
+        vector, self.unflatten = trees.real_vector(y0)
         checks.function("norm", norm, "(y) -> a number", "it is called with a difference of states, of the form of y0")
         self(np.asarray(vector))
 

@@ -131,7 +131,9 @@ def adaptive_program(method: Method, f: VectorField, times: np.ndarray, adjoint:
     return run
 
 
-def final_state(method: Method, run: FixedRun | AdaptiveRun, f: VectorField, t0: float, t1: float, adjoint: Any):
+def final_state(
+    method: Method, run: FixedRun | AdaptiveRun, f: VectorField, t0: float, t1: float, adjoint: Any
+) -> Callable[[PyTree, PyTree], PyTree]:
     """``final(y0, args)``: the state at t1, of a program of its own that has a reverse mode."""
     adjoint = method.options.get("adjoint", adjoint)
     ends = np.array([t0, t1])

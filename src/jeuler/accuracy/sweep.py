@@ -77,7 +77,9 @@ class Sweep:
             found += [Count(path.evaluations, path if path.times.size else None) for path in paths]
         return found
 
-    def rows(self, plan: Plan, inputs: Any, counts: list[Count], truth: Reference, slope: Any, norm: Any) -> Iterator:
+    def rows(
+        self, plan: Plan, inputs: Any, counts: list[Count], truth: Reference, slope: Any, norm: Any
+    ) -> Iterator[dict[str, Any]]:
         """A row for each run of a plan."""
         counted = iter(counts)
         if plan.fixed:

@@ -41,8 +41,8 @@ class Compiled:
 
     def __init__(self, function: Callable[..., Any], *inputs: Any) -> None:
         begun = time.perf_counter()
-        self.program = jax.jit(function).lower(*inputs).compile()
-        self.seconds = time.perf_counter() - begun
+        self.program: Any = jax.jit(function).lower(*inputs).compile()
+        self.seconds: float = time.perf_counter() - begun
 
     def once(self, *inputs: Any) -> tuple[float, Any]:
         """Seconds of one run, and what it returned."""

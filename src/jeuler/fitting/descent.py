@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -94,17 +94,24 @@ class Descent:
             z = optax.apply_updates(z, jax.tree.map(lambda u: damping * u, updates))
             return jnp.clip(z, lower, upper), state
 
-        self.losses, self._value_and_grad = jax.jit(losses), jax.jit(jax.value_and_grad(losses, has_aux=True))
-        self.propose = propose
+        self.losses: Callable[..., Any] = jax.jit(losses)
+        self._value_and_grad = jax.jit(jax.value_and_grad(losses, has_aux=True))
+        self.propose: Callable[..., Any] = propose
         self._propose = jax.jit(functools.partial(propose, losses))
-        self.init, self.task, self.unit, self.tolerance, self.watch = optimizer.init, task, unit, tolerance, watch
+        self.init: Callable[[Any], Any] = optimizer.init
+        self.task: Task = task
+        self.unit: np.ndarray = unit
+        self.tolerance: float = tolerance
+        self.watch: Watch = watch
         self.history: list[float] = []
-        self.nonfinite, self.still = 0, False
+        self.nonfinite: int = 0
+        self.still: bool = False
 
     def run(self, x: np.ndarray, stages: Sequence[np.ndarray], max_iterations: int) -> np.ndarray:
         """Through the stages, then over everything: the best point over everything."""
         z = jnp.asarray(x / self.unit)
-        self.best, self.least = z, np.inf  # over all the data, of all stages
+        self.best: Any = z  # over all the data, of all stages
+        self.least: float = np.inf
         for weights in stages:
             z = self._stage(z, weights, min(max_iterations, max_iterations // 4 + 10))
         self._stage(z, self.task.all_weights, max_iterations)

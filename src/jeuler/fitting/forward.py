@@ -189,7 +189,9 @@ class RungeKuttaInALoop:
     Each stage starts from the slope of the one before; reverse mode would keep all of them.
     """
 
-    order, explicit, in_loop = 4, True, True
+    order: int = 4
+    explicit: bool = True
+    in_loop: bool = True
 
     def increment(self, f: Any, t: Any, y: Any, dt: Any, args: Any) -> Any:
         reach = jnp.asarray([0.0, *(row[-1] for row in RK4.matrix[1:])], dt.dtype) * dt

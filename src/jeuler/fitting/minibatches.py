@@ -24,8 +24,10 @@ class Minibatches:
     """
 
     def __init__(self, descent: Any, problem: Problem, size: int):
-        self.descent, self.data, self.size = descent, problem.data, size
-        self.rows = _rows_of(problem, size)
+        self.descent: Any = descent
+        self.data: Any = problem.data
+        self.size: int = size
+        self.rows: int = _rows_of(problem, size)
         rows, scale, residual = self.rows, jnp.asarray(descent.unit), problem.residual
         shapes = [shape for shape in problem.form.shapes if shape is not None]
         ends = np.cumsum([math.prod(shape) for shape in shapes])

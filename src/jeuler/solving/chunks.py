@@ -53,7 +53,7 @@ def can_be_in_chunks(checkpoint: Any) -> bool:
 
 
 def run_in_chunks(
-    loop_of: Callable[..., Loop], inputs: tuple, settings: tuple, grid: Grid, progress: Progress
+    loop_of: Callable[..., Loop], inputs: tuple[Any, ...], settings: tuple[Any, ...], grid: Grid, progress: Progress
 ) -> tuple[Array, PyTree, Any, Any] | None:
     """The fields of a `Solution` of ``loop_of(*inputs, *settings)``, or None for a run that is to be done in one piece.
 
@@ -150,9 +150,10 @@ class Sizes:
     """How many steps to do at once, from the time that steps took; known from earlier runs of the same program."""
 
     def __init__(self, known: dict[int, float], numbers: int) -> None:
-        self.known, self.numbers = known, numbers  # seconds a step, by how many numbers there are
-        self.warm = numbers in known
-        self.next = max(1, int(SECONDS / known[numbers] if self.warm else FIRST / numbers))
+        self.known: dict[int, float] = known  # seconds a step, by how many numbers there are
+        self.numbers: int = numbers
+        self.warm: bool = numbers in known
+        self.next: int = max(1, int(SECONDS / known[numbers] if self.warm else FIRST / numbers))
 
     def measured(self, steps: int, seconds: float) -> None:
         if not self.warm:  # it may have compiled
