@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import NET_EDGES, net_state
 
 import jeuler
+from jeuler import Gravity, Springs
 
 
 def by_the_formula(p, v, edges, ks, kd, rest_length):
@@ -136,3 +138,25 @@ def test_a_traced_negative_parameter_passes_as_nobody_can_look_at_it():
 
     np.testing.assert_allclose(jax.jit(end)(-1.0), 1.5 + 0.01 * 0.5)
     assert np.isfinite(jax.grad(end)(-1.0))
+
+
+def test_springs_and_gravity_that_change_in_time():
+    """A muscle: at each time the force of springs with the numbers of that time, in a pool too."""
+    state = net_state()
+    ks = jnp.linspace(20.0, 60.0, 5)
+    muscle = Springs(NET_EDGES, ks=lambda t: ks * (1 + t), kd=0.7, rest_length=lambda t: 0.9 - 0.2 * t)
+    then = Springs(NET_EDGES, ks=1.5 * ks, kd=0.7, rest_length=0.8)
+    here = state.position, state.velocity, state.mass
+    np.testing.assert_allclose(muscle(0.5, *here), then(0.5, *here), rtol=1e-12)
+    np.testing.assert_allclose(muscle.energy(0.5, *here[::2]), then.energy(0.5, *here[::2]))
+    pulls = Gravity(lambda t: jnp.stack([t, -9.8]))
+    alive = state.replace(alive=jnp.array([True, True, False, True]))
+
+    def end(*forces):
+        scene = jeuler.Scene(forces, (jeuler.SpeedLimit(9.0),))
+        return jeuler.simulate(scene, alive, t0=0.5, dt=1e-3, num_steps=1).y.velocity[-1]
+
+    np.testing.assert_allclose(end(muscle, pulls), end(then, Gravity([0.5, -9.8])), rtol=1e-12)
+    for wrong, match in ((lambda t: jnp.ones(3), "Springs.ks"), (lambda: 3.0, "function")):
+        with pytest.raises(ValueError, match=match):
+            jeuler.simulate(jeuler.Scene((Springs(NET_EDGES, wrong, 0.1, 1.0),)), state, dt=0.1, num_steps=1)

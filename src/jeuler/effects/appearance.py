@@ -18,7 +18,8 @@ from jeuler.particles.fields import START
 from jeuler.particles.state import DEFAULTS
 
 NOT_DRAWN = (
-    "position", "velocity", "mass", "alive", "age", "lifetime", "births", "missed_births", "steps", "frames", "extra",
+    "position", "velocity", "mass", "alive", "age", "lifetime", "births", "missed_births", "steps", "frames", "force",
+    "extra",
 )  # fmt: skip
 
 

@@ -30,7 +30,7 @@ def mismatched(scene: Scene, state: ParticleState, times: np.ndarray, targets: n
             continue
         pairs = np.asarray(force.edges[:])
         length = float(np.median(np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=-1)))
-        rest = float(np.median(np.asarray(force.rest_length)))
+        rest = float(np.median(np.asarray(force.at(t0).rest_length)))
         if min(length, rest) > 0 and not 1 / OTHER_UNIT < rest / length < OTHER_UNIT:
             words.append(
                 f"forces[{k}].rest_length is {rest:.2g} m where the springs are {length:.2g} m long: "

@@ -120,7 +120,7 @@ def _net(found: SpringFit) -> Net | None:
         return None
 
     def each(field: str) -> np.ndarray:
-        return np.concatenate([np.broadcast_to(np.asarray(getattr(s, field)), len(s.edges)) for s in springs])
+        return np.concatenate([np.broadcast_to(np.asarray(getattr(s.at(0.0), field)), len(s.edges)) for s in springs])
 
     edges: Any = np.concatenate([np.asarray(s.edges) for s in springs])
     pinned = np.isinf(np.broadcast_to(np.asarray(found.state.mass), len(found.state.position)))

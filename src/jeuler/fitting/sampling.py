@@ -53,7 +53,7 @@ def fastest(scene: Scene, mass: np.ndarray) -> float:
     for force in scene.forces:
         if isinstance(force, Springs) and len(force.edges):
             pairs = np.asarray(force.edges[:])
-            ks = np.broadcast_to(np.asarray(force.ks, float), (len(pairs),))
+            ks = np.broadcast_to(np.asarray(force.at(0.0).ks, float), (len(pairs),))
             for end in (0, 1):
                 np.add.at(total, pairs[:, end], ks)
     with np.errstate(all="ignore"):

@@ -162,7 +162,9 @@ def _solve(
         return None
     right, columns, targets, positive = rows.acceleration(), [], [], []
     for k, force in enumerate(scene.forces):
-        part = _spring_terms(rows, force, k, scene, places) if isinstance(force, Springs) else None
+        part = (
+            _spring_terms(rows, force, k, scene, places) if isinstance(force, Springs) and not force.is_moving else None
+        )
         part = _terms_of(rows, force, k, scene, places) if part is None else part
         right = right - part[0]
         for matrix, target, sign in part[1]:

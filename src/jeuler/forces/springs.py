@@ -9,9 +9,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.annotations import Parameter, ParticleIndices
+from jeuler._core.annotations import MovingParameter, ParticleIndices
 from jeuler._core.component import component, replace, store_as_float
-from jeuler._core.components import split, stack
+from jeuler._core.components import per_particle, split, stack
+from jeuler._core.in_time import at_time, moving
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
@@ -59,7 +60,10 @@ def _coefficient_jvp(primals, tangents):
     return c, dot(slopes, changes)
 
 
-@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+PARAMETERS = ("ks", "kd", "rest_length")
+
+
+@component(static=("edges",), positive=PARAMETERS)
 class Springs:
     """Linear springs and dampers between pairs of particles.
 
@@ -70,9 +74,10 @@ class Springs:
 
     Args:
       edges: the two particles (i, j) of each spring, integers (spring, 2). Static: part of the program. May be empty.
-      ks: stiffness of each spring, shape () or (spring,), N/m. Differentiable.
-      kd: damping of each spring, shape () or (spring,), N s/m. Differentiable.
-      rest_length: L, length without force, shape () or (spring,), m. Differentiable.
+      ks: stiffness of each spring, shape () or (spring,), N/m, or a function of time ``ks(t)`` that returns it, as that
+        of a muscle. Differentiable.
+      kd: damping of each spring, shape () or (spring,), N s/m, or a function of time. Differentiable.
+      rest_length: L, length without force, shape () or (spring,), m, or a function of time. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in
       `simulate`, if an index is out of range, a parameter has another shape, or one that is not traced is negative.
@@ -86,23 +91,40 @@ class Springs:
     """
 
     edges: ParticleIndices
-    ks: Parameter
-    kd: Parameter
-    rest_length: Parameter
+    ks: MovingParameter
+    kd: MovingParameter
+    rest_length: MovingParameter
 
     limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", Topology(self.edges))
-        store_as_float(self, "ks", "kd", "rest_length")
+        for name in PARAMETERS:
+            if callable(getattr(self, name)):
+                object.__setattr__(self, name, moving(f"Springs.{name}", getattr(self, name)))
+            else:
+                store_as_float(self, name)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
+        return self.at(t, position.dtype).laid_out(len(position), position.dtype)(t, position, velocity, mass)
 
-    def prepare(self, context: Any) -> PreparedSprings | None:
+    @property
+    def is_moving(self) -> bool:
+        """Whether a parameter is a function of time."""
+        return any(callable(getattr(self, name)) for name in PARAMETERS)
+
+    def at(self, t: Any, dtype: Any = None) -> Springs:
+        """The springs with the numbers of time t in place of functions of time."""
+        if not self.is_moving:
+            return self
+        return replace(self, **{name: at_time(getattr(self, name), t, dtype) for name in PARAMETERS})
+
+    def prepare(self, context: Any) -> PreparedSprings | MovingSprings | None:
         """The springs between the living, laid out for the kernels; None where there are no springs."""
         if not len(self.edges):
             return None
+        if self.is_moving:
+            return MovingSprings(self, context.limits_drag, context.alive)
         return self.laid_out(context.particles, context.dtype, context.limits_drag).prepare(context)
 
     def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedSprings:
@@ -114,18 +136,52 @@ class Springs:
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks (r - L)^2 / 2, J."""
-        ks, rest_length = (self._per_spring(x, position.dtype) for x in (self.ks, self.rest_length))
+        now = self.at(t, position.dtype)
+        ks, rest_length = (per_particle(x.astype(position.dtype)) for x in (now.ks, now.rest_length))
         r, _ = direction(self.edges.difference(position))
         return jnp.sum(ks * (r - rest_length) ** 2) / 2
 
-    @staticmethod
-    def _per_spring(x: Array, dtype: Any) -> Array:
-        return x.astype(dtype)[:, None] if x.ndim else x.astype(dtype)
+    def tension(self, t: Any, state: Any) -> Array:
+        """The pull of each spring on its ends, damper included: (spring,), N; negative where it pushes.
+
+        T = ks (r - L) + kd (v_i - v_j).u
+        """
+        ks, kd, rest_length, r, rate, here = self._now(t, state)
+        return jnp.where(here, ks * (r - rest_length) + kd * rate, 0)
+
+    def strain(self, t: Any, state: Any) -> Array:
+        """How much longer each spring is than its rest length, (r - L) / L: (spring,); NaN where L = 0."""
+        _, _, rest_length, r, _, here = self._now(t, state)
+        has_length = rest_length > 0
+        return jnp.where(here, jnp.where(has_length, r / jnp.where(has_length, rest_length, 1) - 1, jnp.nan), 0)
+
+    def stored_energy(self, t: Any, state: Any) -> Array:
+        """The energy in each spring, ks (r - L)^2 / 2: (spring,), J."""
+        ks, _, rest_length, r, _, here = self._now(t, state)
+        return jnp.where(here, ks * (r - rest_length) ** 2 / 2, 0)
+
+    def damper_power(self, t: Any, state: Any) -> Array:
+        """The power that each damper turns into heat, kd ((v_i - v_j).u)^2: (spring,), W."""
+        _, kd, _, _, rate, here = self._now(t, state)
+        return jnp.where(here, kd * rate**2, 0)
+
+    def _now(self, t: Any, state: Any) -> tuple[Any, ...]:
+        """ks, kd and L at time t; length and its rate of change; whether both ends live."""
+        state.check()
+        self.check(*state.position.shape)
+        dtype = state.position.dtype
+        now = self.at(t, dtype)
+        r, u = direction(self.edges.difference(state.position))
+        velocity = jnp.where(per_particle(jnp.isinf(state.mass)), 0, state.velocity)
+        rate = jnp.sum(self.edges.difference(velocity) * u, axis=1)
+        here = True if state.alive is None else jnp.all(state.alive[self.edges[:]], axis=1)
+        return now.ks.astype(dtype), now.kd.astype(dtype), now.rest_length.astype(dtype), r[:, 0], rate, here
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
-        for name in ("ks", "kd", "rest_length"):
-            shape = getattr(self, name).shape
+        for name in PARAMETERS:
+            value = getattr(self, name)
+            shape = (checks.form_of(f"Springs.{name}", at_time, value, 0.0) if callable(value) else value).shape
             checks.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
         check_limits(self)
 
@@ -153,11 +209,33 @@ class PreparedSprings:
         """Between the living only: a spring with a dead end has no stiffness and no damping."""
         if context.alive is None:
             return self
-        both = jnp.all(context.alive[self.edges[:]], axis=1)
-        here = [layout.to_slots(both) for layout in self.layouts]
+        return self.only(jnp.all(context.alive[self.edges[:]], axis=1))
+
+    def only(self, which: Array) -> PreparedSprings:
+        """These springs only, (spring,) boolean: the others have no stiffness and no damping."""
+        here = [layout.to_slots(which) for layout in self.layouts]
 
         def only_here(parameter):
             groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
             return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
 
         return replace(self, ks=only_here(self.ks), kd=only_here(self.kd))
+
+
+@component(static=("read_again",))
+class MovingSprings:
+    """Springs with functions of time among their parameters, as they are in a run: laid out again at each time."""
+
+    springs: Springs
+    read_again: bool  # see `Layout.central_force`
+    alive: Any = None
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        now = self.springs.at(t, position.dtype).laid_out(len(position), position.dtype, self.read_again)
+        if self.alive is not None:
+            now = now.only(jnp.all(self.alive[self.springs.edges[:]], axis=1))
+        return now(t, position, velocity, mass)
+
+    def prepare(self, context: Any) -> MovingSprings:
+        """Between the living only."""
+        return self if context.alive is None else replace(self, alive=context.alive)

@@ -12,6 +12,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.component import as_component, component, replace
+from jeuler.particles import loads
 from jeuler.particles.equation import Attributes, Equation
 from jeuler.particles.fields import declared, name_of, with_required_fields
 from jeuler.particles.protocols import Context
@@ -135,6 +136,73 @@ class Scene:
         state = with_required_fields(state, self.forces, self.effects)
         self.check(state)
         return (state.position, state.velocity), self.attributes(state)
+
+    def force(self, t: Any, state: ParticleState) -> Array:
+        """The sum of the scene's forces on each particle, pinned and prescribed ones too.
+
+            F_i = sum of forces on i
+
+        At a pinned or prescribed particle it is the load on the support, what a load cell there shows; `reactions` is
+        what the support exerts. Effects, such as impacts of `Collisions`, are no part of it: see ``state.force``.
+
+        Args:
+          t: time, (), s.
+          state: the particles at that time. ``jax.vmap(scene.force)(solution.t, solution.y)`` reads a whole run.
+        Returns: (particle, dim), N; 0 on a dead slot.
+        Raises: ValueError, if the state does not fit the scene, or has an axis of times.
+        Example:
+          >>> import jeuler
+          >>> spring = jeuler.Springs([[0, 1]], ks=10.0, kd=0.0, rest_length=1.0)
+          >>> scene = jeuler.Scene((spring, jeuler.Gravity([-8.0])))
+          >>> state = jeuler.ParticleState([[0.0], [-1.5]], [[0.0], [0.0]], mass=[float("inf"), 0.5])
+          >>> scene.force(0.0, state).tolist(), scene.reactions(0.0, state).tolist()
+          ([[-5.0], [1.0]], [[5.0], [0.0]])
+        """
+        equation, y, args = self._at(state)
+        return loads.loads(equation, t, y, args)
+
+    def forces_by_name(self, t: Any, state: ParticleState) -> dict[str, Array]:
+        """What each force of the scene exerts on each particle: their sum is `force`.
+
+        Args:
+          t: time, (), s.
+          state: the particles at that time.
+        Returns: by the name of the force's class or function, (particle, dim), N. Where several have one name, they
+          are counted from 0 in the order of the scene: "Springs[0]", "Springs[1]".
+        Raises: ValueError, as `force`.
+        Example:
+          >>> import jeuler
+          >>> scene = jeuler.Scene((jeuler.LinearDrag(0.5), jeuler.Gravity([-8.0])))
+          >>> state = jeuler.ParticleState([[0.0]], [[2.0]], mass=0.5)
+          >>> {name: force.tolist() for name, force in scene.forces_by_name(0.0, state).items()}
+          {'LinearDrag': [[-1.0]], 'Gravity': [[-4.0]]}
+        """
+        equation, y, args = self._at(state)
+        each = loads.each_force(equation, t, y, args)
+        nothing = jnp.zeros_like(y[0])
+        return {name: each.get(k, nothing) for k, name in enumerate(loads.names_of(self.forces))}
+
+    def reactions(self, t: Any, state: ParticleState) -> Array:
+        """What the supports exert on pinned and prescribed particles.
+
+            R_i = m_i a_i - F_i
+
+        a_i is that of the path of a prescribed particle, and 0 of a pinned one. A prescribed particle of mass inf has
+        no inertia here.
+
+        Args:
+          t: time, (), s.
+          state: the particles at that time.
+        Returns: (particle, dim), N; 0 on particles that are free.
+        Raises: ValueError, as `force`.
+        """
+        equation, y, args = self._at(state)
+        return loads.reactions(equation, t, y, args)
+
+    def _at(self, state: ParticleState) -> tuple[Equation, tuple[Array, Array], Attributes]:
+        """The equation for this state, its position and velocity, and its attributes."""
+        y, args = self.as_equation(state)
+        return Equation.of(self.forces, self.effects, Context(len(y[0]), y[0].dtype)), y, args
 
     def energy(self, t: Any, y: tuple[Array, Array], mass: Any) -> Array:
         """Kinetic and potential energy of the particles that can move, J; of the forces that have a potential.

@@ -54,6 +54,7 @@ class ParticleState:
       steps: () int32, the steps taken since the start, where random numbers or births hang on it: a run from a saved
         state goes on with those of the run that it was saved from.
       frames: (particle,) int32, the steps that a particle has lived, where `Lifetime` counts them.
+      force: (particle, dim), N, what acted on each particle in the last step, where a user asks for it, see `simulate`.
       extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
     Raises: ValueError, if a field is not an array of numbers; `simulate` checks the shapes.
     Example:
@@ -80,6 +81,7 @@ class ParticleState:
     unresolved_contacts: OptionalParameter = default(None)
     steps: OptionalParameter = default(None)
     frames: OptionalParameter = default(None)
+    force: OptionalParameter = default(None)
     extra: dict[str, Array] | None = None
 
     def __post_init__(self) -> None:
@@ -171,6 +173,11 @@ class ParticleState:
                 raise ValueError(f"state.{name} must be floating, got {dtype}; convert it, jnp.asarray(x, dtype=float)")
             if name in DEFAULTS:
                 checks.shape(f"state.{name}", shape, (particles, *DEFAULTS[name][0]))
+            if name == "force" and (shape, dtype) != (self.position.shape, self.position.dtype):
+                raise ValueError(
+                    f"state.force must be an array as position, {self.position.dtype} {self.position.shape}, "
+                    f"got {dtype} {shape}; write state.replace(force=jnp.zeros_like(state.position))"
+                )
             if name in (self.extra or {}) and shape[:1] not in ((), (particles,)):
                 raise ValueError(f"state.{name} must have shape () or ({particles}, ...), one a particle, got {shape}")
         if self.alive is not None and self.alive.dtype != bool:

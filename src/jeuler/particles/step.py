@@ -14,10 +14,11 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.component import replace
-from jeuler._core.components import split, stack
+from jeuler._core.components import per_particle, split, stack
 from jeuler.contact.collisions import Collisions
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import BEFORE, acts, name_of, needs
+from jeuler.particles.loads import held, loads
 from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState, join_state, split_state, zero_dead_slots
@@ -121,6 +122,9 @@ class SceneStep:
         for name, effect in self.effects(n, number, early=False):
             moment = Moment(state=effect(self.grid.clock(n + 1), self.grid.dt, before.state, moment.state))
             yield name, moment, remainder
+        if rest.force is not None:
+            moment = Moment(state=replace(moment.state, force=self.acted(t, before.state, motion, moment.state)))
+            yield "force", moment, remainder
         if self.scene.effects and rest.alive is not None:
             yield "dead slots", Moment(state=zero_dead_slots(moment.state)), remainder
 
@@ -151,14 +155,36 @@ class SceneStep:
             mass = mass.at[indices].set(jnp.inf)
         return mass
 
+    def acted(self, t: Any, before: ParticleState, motion: tuple[Any, ...], after: ParticleState) -> Array:
+        """The mean force on each particle in the step from t, of the motion and of the effects after it.
+
+        F = m (v(t + dt) - v(t)) / dt,   and for pinned and prescribed particles the sum of the forces at t
+        """
+        attributes = self.scene.attributes(before)
+        mass = jnp.broadcast_to(before.mass, (len(before.position),))
+        support = held(self.equation, t, mass, before.position.dtype)
+        gained = after.velocity - before.velocity
+        if hasattr(self.step, "increment") and self.contact_in_the_solve() is None:
+            # not as a difference of velocities, which has lost the digits of a small one
+            pushed = self.step.increment(self.field, t, split_state(before)[0], self.grid.dt, attributes)[1]
+            gained = stack(pushed) + (after.velocity - stack(motion[1]))
+        free = jnp.where(per_particle(support), 0, per_particle(jnp.where(support, 1, mass)) * gained / self.grid.dt)
+        return jnp.where(per_particle(support), self.load(t, before, attributes), free)
+
+    def load(self, t: Any, state: ParticleState, attributes: Any) -> Array:
+        return loads(self.windowed(len(state.position)), t, (state.position, state.velocity), attributes)
+
     def field(self, t: Any, motion: tuple[Any, ...], attributes: Any) -> tuple[Any, ...]:
         """The equation of motion by component, as the motion is carried from step to step."""
         position, velocity = map(stack, motion)
-        equation = self.equation
-        if self.any_window and len(position) != equation.context.particles:
-            context = dataclasses.replace(equation.context, particles=len(position))
-            equation = Equation.of(self.scene.forces, self.scene.effects, context)
-        return tuple(map(split, equation.vector_field(t, (position, velocity), attributes)))
+        return tuple(map(split, self.windowed(len(position)).vector_field(t, (position, velocity), attributes)))
+
+    def windowed(self, particles: int) -> Equation:
+        """The equation for this many particles, those of a window."""
+        if not self.any_window or particles == self.equation.context.particles:
+            return self.equation
+        context = dataclasses.replace(self.equation.context, particles=particles)
+        return Equation.of(self.scene.forces, self.scene.effects, context)
 
 
 def with_its_needs(effect: Any, key: Array | None, n: Any, t0: Array) -> Callable[..., Any]:

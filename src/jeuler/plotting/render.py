@@ -201,7 +201,8 @@ class Picture:
         if self.look.links == "color":
             lines.set_color(rgba[edges[seen]].mean(axis=1))
             return
-        rest = np.broadcast_to(np.asarray(force.rest_length), len(edges))[seen]
+        now = force.at(t) if hasattr(force, "at") else force
+        rest = np.broadcast_to(np.asarray(now.rest_length), len(edges))[seen]
         strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / np.where(rest > 0, rest, 1) - 1
         lines.set_color(STRAIN(np.clip(0.5 + strain / 0.4, 0, 1)))
 
