@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from matplotlib import animation
 from matplotlib import pyplot as plt
+from matplotlib.collections import LineCollection
 from PIL import Image
 
 from jeuler import ParticleState, Scene, Solution, Springs
@@ -199,9 +200,23 @@ def test_the_ground_fills_the_picture_to_its_edges(tmp_path):
 
 
 def test_a_whole_solution_is_no_frame_and_a_path_has_a_known_end(tmp_path):
-    with pytest.raises(ValueError, match=r"frame.position must have shape \(particle, 2\) .* take one frame"):
+    with pytest.raises(ValueError, match=r"frame.position must have shape \(particle, dim\), dim 1, .* take one frame"):
         draw(film().y)
     with pytest.raises(ValueError, match=r"must end in .gif, .mp4 or .html, got 'film.avi'"):
         animate(film(), path=tmp_path / "film.avi")
     with pytest.raises(ValueError, match=r"needs a solution whose .y is a ParticleState"):
         animate(Solution(jnp.zeros(2), jnp.zeros(2), jnp.int32(-1)))
+
+
+def test_what_moves_on_a_line_is_drawn_and_filmed(tmp_path):
+    springs = Springs([[0, 1]], ks=25.0, kd=0.3, rest_length=1.0)
+    scene = Scene((springs,), (Collisions((Plane([-0.3], [1.0]),)),))
+    weight = ParticleState([[0.0], [1.5]], np.zeros((2, 1)), mass=[jnp.inf, 1.0])
+    solution = Solution(jnp.arange(2.0), jax.tree.map(lambda x: jnp.stack([x, x]), weight), jnp.int32(-1))
+    made = animate(solution, scene, tmp_path / "line.gif", progress=False)
+    assert repr(made) == "Film(2 frames, to t = 1 s, 25 a second of film)"
+    assert Image.open(tmp_path / "line.gif").n_frames == 1, "nothing moves: Pillow keeps one"
+    ax = draw(weight, scene, camera=Camera(center=[0.5], width=3.0))
+    lines = next(c for c in ax.collections if isinstance(c, LineCollection))
+    np.testing.assert_allclose(lines.get_segments(), [[[0.0, 0.0], [1.5, 0.0]]])
+    assert np.allclose(ax.get_xlim(), [-1.0, 2.0])

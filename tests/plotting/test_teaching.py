@@ -85,3 +85,21 @@ def test_stability_regions_have_their_extent_and_the_eigenvalues_on_top():
     assert min(left) == pytest.approx(-2.785, abs=0.02)
     assert any(x == pytest.approx(-2.0, abs=0.02) for x in left)
     assert jnp.ones(1).dtype == jnp.float64
+
+
+def test_a_tangent_leaves_its_curve_by_the_local_error():
+    drawn = teaching.tangent_step(field, t0=1.0, dt=2.0, exact=exact)
+    end = exact(1.0) + 2 * (1 + exact(1.0) / 5)
+    np.testing.assert_allclose(drawn.lines[1].get_ydata(), [exact(1.0), end], rtol=1e-6)
+    np.testing.assert_allclose(drawn.lines[2].get_ydata(), [end, exact(3.0)], rtol=1e-6)
+
+
+def test_the_polygon_goes_from_curve_to_neighbouring_curve():
+    """Each curve is a solution, y + 5 t + 25 = c exp(t / 5), and has its corner on it."""
+    *curves, polygon = teaching.neighbouring_curves(field, -3.0, t0=0.0, t1=5.0, num_steps=3).lines
+    constants = [(c.get_ydata() + 5 * c.get_xdata() + 25) / np.exp(c.get_xdata() / 5) for c in curves]
+    assert len(curves) == 4
+    for constant, x, y in zip(constants, *polygon.get_data(), strict=True):
+        np.testing.assert_allclose(constant, (y + 5 * x + 25) / np.exp(x / 5), rtol=1e-6)
+    assert np.all(np.diff([constant[0] for constant in constants]) < 0), "each step falls to a lower curve"
+    assert {text.get_text() for text in polygon.axes.texts} == {"exact", "steps"}

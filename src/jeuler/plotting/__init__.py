@@ -10,9 +10,11 @@ from jeuler.plotting.teaching import (
     error_against_dt,
     euler_polygon,
     local_and_cumulative_error,
+    neighbouring_curves,
     slope_field,
     stability_regions,
     step_sizes,
+    tangent_step,
 )
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "error_against_dt",
     "euler_polygon",
     "local_and_cumulative_error",
+    "neighbouring_curves",
     "plot_correlation",
     "plot_fit",
     "plot_history",
@@ -32,6 +35,7 @@ __all__ = [
     "slope_field",
     "stability_regions",
     "step_sizes",
+    "tangent_step",
 ]
 
 

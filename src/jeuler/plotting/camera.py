@@ -45,12 +45,18 @@ def new_axes(dim: int, background: Any, size: tuple[float, float] = (6.0, 4.5)) 
         ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set_facecolor(background)
     ax.set_axis_off()
-    if dim == 2:
+    if dim < 3:
         ax.set_aspect("equal", adjustable="box")
     else:
         ax.set_proj_type("ortho")
         ax.computed_zorder = False  # solids first; what they hide is left out (`in_sight`)
     return ax
+
+
+def in_plane(x: Any) -> np.ndarray:
+    """Points (..., dim); those of a line, dim = 1, as points of the plane with height 0."""
+    x = np.asarray(x)
+    return np.concatenate([x, np.zeros_like(x)], axis=-1) if x.shape[-1] == 1 else x
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,10 +70,11 @@ class View:
     @classmethod
     def of(cls, camera: Camera, position: np.ndarray, alive: np.ndarray) -> View:
         """Fits positions (frame, particle, dim), those of the living."""
+        position = in_plane(position)
         dim = position.shape[-1]
         seen = position[alive] if alive.any() else np.zeros((1, dim))
         low, high = np.percentile(seen, [0.5, 99.5], axis=0) if len(seen) > 2000 else (seen.min(0), seen.max(0))
-        center = (low + high) / 2 if camera.center is None else np.asarray(camera.center, float)
+        center = (low + high) / 2 if camera.center is None else in_plane(np.asarray(camera.center, float))
         half = 0.55 * (high - low)
         half = np.maximum(half, 0.2 * half.max() or 1.0)
         if camera.width is not None:

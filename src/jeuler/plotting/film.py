@@ -79,6 +79,10 @@ class Film:
     def frames(self) -> int:
         return len(range(0, len(self.solution.t), self.every))
 
+    def __repr__(self) -> str:
+        last = float(np.asarray(self.solution.t)[-1])
+        return f"Film({self.frames} frames, to t = {last:g} s, {self.fps} a second of film)"
+
     def save(self, path: Any) -> None:
         """Write the film: .gif, .mp4 or .html."""
         path = pathlib.Path(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.collections import LineCollection, PathCollection, PolyCollectio
 from jeuler._core.component import result
 from jeuler.particles.fields import declared
 from jeuler.particles.state import ParticleState
-from jeuler.plotting.camera import Camera, View, new_axes
+from jeuler.plotting.camera import Camera, View, in_plane, new_axes
 from jeuler.plotting.solids import draw_colliders, in_sight, shaded
 
 MARKERS = ("o", "s", "^", "D", "*")  # by state.shape
@@ -62,14 +63,14 @@ def draw(
     Particles take colour, opacity, size (m) and shape from the state; the dead are not drawn.
 
     Args:
-      frame: a `ParticleState`, position (particle, dim) with dim 2 or 3.
+      frame: a `ParticleState`, position (particle, dim) with dim 1, 2 or 3; what moves on a line is drawn along it.
       scene: the `Scene`; None draws the particles alone.
       ax: Matplotlib axes to draw on, of projection "3d" in space; None makes new ones.
       camera: what is shown; None fits the particles.
       look: how it is shown; None draws springs by their strain on white.
       t: the time, s, for colliders that move.
     Returns: the axes.
-    Raises: ValueError, if the frame has a time axis or its dimension is not 2 or 3.
+    Raises: ValueError, if the frame has a time axis or its dimension is none of 1, 2 and 3.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> from jeuler.plotting import draw
@@ -78,9 +79,9 @@ def draw(
       2
     """
     position = np.asarray(frame.position)
-    if position.ndim != 2 or position.shape[1] not in (2, 3):
+    if position.ndim != 2 or position.shape[1] not in (1, 2, 3):
         raise ValueError(
-            f"frame.position must have shape (particle, 2) or (particle, 3), got {position.shape}; of a solution take "
+            f"frame.position must have shape (particle, dim), dim 1, 2 or 3, got {position.shape}; of a solution take "
             f"one frame, jax.tree.map(lambda x: x[n], solution.y)"
         )
     camera, look = camera or Camera(), look or Look()
@@ -115,6 +116,16 @@ def colors_of(state: ParticleState) -> np.ndarray:
     return rgba
 
 
+@dataclasses.dataclass(frozen=True)
+class AlongLine:
+    """A collider of the line, drawn in the plane: all heights are alike."""
+
+    collider: Any
+
+    def __call__(self, t: Any, point: Any) -> Any:
+        return self.collider(t, point[:1])
+
+
 class Picture:
     """The artists of one scene, made once and moved from frame to frame."""
 
@@ -127,16 +138,21 @@ class Picture:
     lines: list[Any]
     faces: Any
     moving: bool
+    dot_size: float
 
     def __init__(self, ax: Any, scene: Any, view: View, look: Look, frame: ParticleState, t: float) -> None:
         self.ax, self.view, self.look = ax, view, look
-        position = np.asarray(frame.position)
+        position = in_plane(frame.position)
         self.dim = position.shape[1]
         view.aim(ax, position, alive_of(frame), t)
         forces, effects = getattr(scene, "forces", ()), getattr(scene, "effects", ())
         self.colliders = [collider for effect in effects for collider in declared(effect, "colliders")]
         self.colliders += [force.collider for force in forces if hasattr(force, "collider")]
         self.springs = [force for force in forces if hasattr(force, "rest_length")] if look.links else []
+        self.dot_size = DEFAULT_SIZE if not self.springs else 1.5
+        if np.shape(frame.position)[1] == 1:
+            self.colliders = [AlongLine(collider) for collider in self.colliders]
+            self.dot_size = 2 * DEFAULT_SIZE
         self.lines = [self._new_lines() for _ in self.springs]
         self.faces = None if look.faces is None else self._new_faces()
         self.dots: list[PathCollection] = []
@@ -167,7 +183,7 @@ class Picture:
 
     def update(self, frame: ParticleState, t: float) -> None:
         """Show another frame."""
-        position, alive, rgba = np.asarray(frame.position), alive_of(frame), colors_of(frame)
+        position, alive, rgba = in_plane(frame.position), alive_of(frame), colors_of(frame)
         self.view.aim(self.ax, position, alive, t)
         if self.moving:
             self._draw_solids(t)
@@ -211,7 +227,7 @@ class Picture:
     ) -> list[Any]:
         shape = np.zeros(len(position), int) if frame.shape is None else np.asarray(frame.shape) % len(MARKERS)
         if frame.size is None:
-            points = np.full(len(position), DEFAULT_SIZE if not self.springs else 1.5)
+            points = np.full(len(position), self.dot_size)
         else:
             points = np.asarray(frame.size) * self.view.points_a_metre(self.ax)
         artists = []
