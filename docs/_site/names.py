@@ -28,6 +28,7 @@ PARTS = {  # the order in which a reader needs them
     "contact": "Contact",
     "samplers": "Samplers",
     "fitting": "Fitting",
+    "observing": "What sensors show",
     "accuracy": "Accuracy and cost",
     "diagnosis": "Finding faults",
     "plotting": "Figures and films",
@@ -44,7 +45,7 @@ def public_names() -> dict[str, dict[str, Any]]:
         if not inspect.ismodule(thing) and name != "__version__":
             part = getattr(thing, "__module__", type(thing).__module__).split(".")[1]
             found.setdefault(part, {})[f"jeuler.{name}"] = thing
-    for part in ("plotting", "scenes"):
+    for part in ("observing", "plotting", "scenes"):
         module = importlib.import_module(f"jeuler.{part}")
         found[part] = {f"jeuler.{part}.{name}": getattr(module, name) for name in dir(module) if name[0] != "_"}
     return found

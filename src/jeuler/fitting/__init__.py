@@ -5,6 +5,7 @@ from jeuler.fitting._fit import fit
 from jeuler.fitting._identifiability import Identifiability, identifiability
 from jeuler.fitting._multiple_shooting import ShootingFit, multiple_shooting
 from jeuler.fitting._springs import SpringFit, fit_springs
+from jeuler.fitting.measured.recording import Recording
 from jeuler.fitting.result import Fit
 from jeuler.fitting.trajectory import Trajectory, read_trajectory
 
@@ -12,6 +13,7 @@ __all__ = [
     "Fit",
     "FoundSprings",
     "Identifiability",
+    "Recording",
     "ShootingFit",
     "SpringFit",
     "Trajectory",

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
-
-from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.fitting.beside import attach, attached
+from jeuler.fitting.held_out import judged, recordings_without
+from jeuler.fitting.measured.readings import SENSOR_PARAMETERS
+from jeuler.fitting.measured.recording import Recording, listed
+from jeuler.fitting.measured.task import Several
 from jeuler.fitting.options import Options
 from jeuler.fitting.pages import RECORDING, page_of
 from jeuler.fitting.parameters import values_of_springs
 from jeuler.fitting.profiles import AGAIN
 from jeuler.fitting.recorded import Recorded
-from jeuler.fitting.result import Fit, as_pytree
+from jeuler.fitting.result import DENSITY, Fit, as_pytree
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, rk4_step
@@ -33,17 +35,21 @@ class SpringFit(Fit):
     Attributes:
       ks, kd: stiffness (N/m) and damping (N s/m) of the fitted scene's `Springs`, fitted or not; where the scene has
         several, one array with one value a spring.
-      scene, state: the scene and the initial state with the fitted parameters put in.
+      scene, state: the scene and the initial state with the fitted parameters put in; of several recordings a tuple of
+        states.
       params: the fitted parameters by name.
-      loss: mean square of position residuals, m^2; over sigma^2 where sigma is given.
+      loss: mean square of the residuals, m^2 for positions; over sigma^2 where sigma is given.
       history: the loss after each iteration.
       stderr: standard errors by name, of the structure of params, for noise that is correlated as the residual is; inf
         where the data do not determine one. ``stderr_white``: the same for independent noise.
       covariance: of the parameters in the order of ``jax.flatten_util.ravel_pytree(params)``.
-      predicted: positions at the given times, (time, particle, dim), m.
+      predicted: positions at the given times, (time, particle, dim), m; with ``observe`` what that shows, (time, ...);
+        of several recordings a tuple of them.
       step_bias: how far the integrator's own error moves each parameter, of the structure of params: fitted minus what
         an exact integrator would give. None where it was not asked for.
       start: where the search began: "data" (from the positions alone) or "given" (the scene's values).
+      training_rms, held_out_rms: root mean square of prediction minus measurement over the part that was fitted and
+        over that which was held out; None where nothing was.
       explained: share of the variance of the positions that the fit explains.
       noise_ratio: residual over the noise seen in the data, or over sigma; 1 where nothing is left to explain.
       converged, message, undetermined, blind, at_bound, autocorrelation, residual, nonfinite, starts: as in `Fit`.
@@ -63,10 +69,12 @@ class SpringFit(Fit):
     ks: Any
     kd: Any
     scene: Scene
-    state: ParticleState
-    predicted: Array
+    state: Any
+    predicted: Any
     step_bias: Any = None
     start: str = "given"
+    training_rms: float | None = None
+    held_out_rms: float | None = None
 
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write the fit as one HTML file, which a browser opens without a network.
@@ -100,16 +108,22 @@ as_pytree(SpringFit, ("message", "undetermined", "blind", "at_bound", "start"))
 def fit_springs(
     scene: Scene,
     state: ParticleState,
-    times: Any,
-    positions: Any,
+    times: Any = None,
+    positions: Any = None,
     *,
     dt: float,
+    observe: Any = "position",
+    recordings: Sequence[Recording] | None = None,
     parameters: tuple[str, ...] = ("ks", "kd"),
+    per_recording: tuple[str, ...] | None = None,
     where: Callable[[Scene], Any] | None = None,
+    ties: dict[str, Any] | None = None,
     bounds: dict[str, Any] | None = None,
     sigma: Any = None,
     weights: Any = None,
     priors: dict[str, Any] | None = None,
+    smoothness: dict[str, float] | None = None,
+    held_out: Any = None,
     loss: str = "linear",
     loss_scale: float | None = None,
     start: str = "data",
@@ -125,7 +139,7 @@ def fit_springs(
     resume: Any = None,
     progress: bool | None = None,
 ) -> SpringFit:
-    """Fit a scene's parameters to measured positions by gradient through the simulation.
+    """Fit a scene's parameters to what was measured, positions or else, by gradient through the simulation.
 
         minimise  loss = mean over observed k of |p(t_k) - target_k|^2 / dim
 
@@ -136,19 +150,34 @@ def fit_springs(
       scene: forces and effects, with the starting values of what is fitted.
       state: the state at t0, with the starting values of what is fitted; mass = inf marks the anchors.
       times: when the positions were measured, (time,), s; not decreasing, on any grid, from t0 on.
-      positions: what was measured, (time, particle, dim), m; NaN = not observed.
+      positions: what was measured, (time, particle, dim), m, or with ``observe`` what that shows, (time, ...); NaN =
+        not observed.
       dt: step size of the simulation, s.
+      observe: what was measured: "position", "velocity", "acceleration" of all particles, one of `jeuler.observing`
+        (an angle, a distance, the pull of a spring, a camera's picture), or any function of (scene, state) or
+        (t, state) that returns one array. With ``Sensor(...)``, or a name of these in ``parameters``, it has a "delay",
+        a "gain" and a "bias"; a delay is looked for from 0 to a tenth of the record unless ``bounds`` say otherwise,
+        and what the largest would put before t0 is left out.
+      recordings: several `Recording` in place of times and positions, of any lengths and rates, fitted together:
+        each has its own initial positions, velocities and anchors where these are ``parameters``; all else is shared.
       parameters: what is free: any of "ks", "kd", "rest_length" (of the scene's springs, or another parameter of its
         forces, such as "coefficient" of a drag; "forces[1].ks" names that of one force), "mass" (of the particles that
         can move), "velocity", "position" (their initial ones) and "anchors" (positions of the pinned particles).
         What cannot be negative by its meaning is fitted from 0 on, 0 included.
       where: a function of the scene that picks further arrays to fit, such as ``lambda scene: scene.forces[1].ks``;
         they are ``params["where"]``.
+      per_recording: with ``recordings``, the parameters of which each has its own value, along a leading axis.
+      ties: ``{name: labels}``, a label for each number of a parameter: those with the same label are one unknown, and
+        ``params[name]`` has one number for each label, in the order in which they first come.
       bounds: ``{name: (lower, upper)}`` for any of the parameters; None or inf leaves a side open.
       sigma: the known error of the positions, m, broadcast to (time, particle, dim); errors are then not scaled by the
         residual.
       weights: relative weights instead, broadcast to (time, particle, dim).
       priors: ``{name: (mean, sigma)}`` of parameters, known beforehand, as in `fit`; they need ``sigma``.
+      smoothness: ``{name: sigma}`` of parameters with one number a spring: springs that share a particle differ by
+        about sigma, a prior on each such difference, (parameter - its neighbour) / sigma. It needs ``sigma``.
+      held_out: the part that is not fitted, to judge the fit by: a share of the span at its end, such as 0.3, or
+        booleans (time,). ``training_rms`` and ``held_out_rms`` are the residuals of both parts.
       loss, loss_scale: "linear", or "soft_l1" or "huber" for outliers, as in `fit`.
       start: "data" finds ks, kd and what else enters the forces linearly from the positions alone, by the weak form of
         the equation of motion, and starts there; "given" starts from the scene's values. Where the first does not lead
@@ -196,11 +225,28 @@ def fit_springs(
     checks.true_or_false("step_bias", step_bias)
     if start not in ("data", "given"):
         raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
-    task = Recorded.of(
-        scene, state, times, positions, dt=dt, t0=t0, num_steps=num_steps, step=step, names=parameters, where=where
-    )
-    found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors)
+    if isinstance(parameters, str):
+        raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {parameters!r}')
+    alone = recordings is None
+    records = [Recording(times, positions)] if recordings is None else listed(recordings, times, positions)
+    whole, held = [each.values for each in records], None
+    if held_out is not None:
+        records, held = recordings_without(held_out, records)
+    of_scene: dict[str, Any] = {"dt": dt, "t0": t0, "step": step, "names": parameters, "where": where, "ties": ties}
+    task: Recorded | Several
+    if not alone or observe != "position" or any(name in SENSOR_PARAMETERS for name in parameters):
+        of_record = {"observe": observe, "bounds": bounds, "sigma": sigma, "weights": weights}
+        if num_steps is not None:
+            raise ValueError("num_steps is for positions alone; leave it out: the run reaches the last time")
+        task = Several.of(scene, state, records, single=alone, per_recording=per_recording, **of_record, **of_scene)
+        found, begun = task.fit(options, start, grow, priors, smoothness)
+    else:
+        task = Recorded.of(scene, state, times, records[0].values, num_steps=num_steps, **of_scene)
+        found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors, smoothness)
     fields, bias, fitted_scene, fitted_state, predicted = task.completed(found, step_bias)
+    if held is not None and not task.traced:
+        task = task.seen_whole(whole[0] if alone else whole)
+        fields |= judged(task.series_of_each(predicted), held, fields["message"])
     complete = SpringFit(
         ks=values_of_springs(fitted_scene, "ks"),
         kd=values_of_springs(fitted_scene, "kd"),
@@ -211,6 +257,7 @@ def fit_springs(
         start=begun,
         **fields,
     )
-    attach(complete, AGAIN, attached(found.fit, AGAIN))
+    for name in (AGAIN, DENSITY):
+        attach(complete, name, attached(found.fit, name))
     attach(complete, RECORDING, task)
     return complete

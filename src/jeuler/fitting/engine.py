@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jeuler.fitting.beside import attach
+from jeuler.fitting.density import Density
 from jeuler.fitting.descent import by_optax
 from jeuler.fitting.kept import Record
 from jeuler.fitting.least_squares import State, Task
@@ -18,7 +19,7 @@ from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import Problem, programs
 from jeuler.fitting.profiles import AGAIN, Again
 from jeuler.fitting.report import NOT_FINITE, ending, report
-from jeuler.fitting.result import Fit
+from jeuler.fitting.result import DENSITY, Fit
 from jeuler.fitting.starts import best_start
 
 PyTree = Any
@@ -74,6 +75,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
     if fit.stderr is not None:
         task = task._replace(spread=np.asarray(found.spread))
         attach(fit, AGAIN, _again(problem, evaluate, options.loss, task, state, fit))
+    attach(fit, DENSITY, Density.of(problem, options.loss, state.residual, found.spread))
     return Outcome(fit, state)
 
 

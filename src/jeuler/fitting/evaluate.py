@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jeuler._jax.haste import Haste, jit_in_haste
+
 COLUMNS_AT_ONCE = 16
 
 Residual = Callable[[Array, Any], Array]
@@ -36,12 +38,12 @@ class Evaluate:
         return self.at(x, data)
 
 
-def evaluations(residual: Residual, compiled: bool) -> Evaluate:
+def evaluations(residual: Residual, compiled: bool, haste: Haste = "none") -> Evaluate:
     """The forms of a residual: traced, or compiled, where a residual and its Jacobian share one program."""
     both = functools.partial(residual_and_jacobian, residual)
     if not compiled:
         return Evaluate(residual, both, functools.partial(_traced, residual, both))
-    program = jax.jit(functools.partial(columns, residual))
+    program = jit_in_haste(functools.partial(columns, residual), haste)
     return Evaluate(jax.jit(residual), jax.jit(both), functools.partial(by_blocks, program))
 
 

@@ -11,17 +11,20 @@ from jeuler._core import checks
 
 
 def checked_observations(
-    times: Any, positions: Any, shape: tuple[int, ...], t0: float, name: str = "positions"
+    times: Any,
+    positions: Any,
+    shape: tuple[int, ...],
+    t0: float,
+    name: str = "positions",
+    meaning: str = "(time, particle, dim)",
 ) -> tuple[np.ndarray, Any]:
     """Times and targets as float64 NumPy arrays, checked; ``name`` is what the user calls the targets."""
     times = checks.reals("times", times, "numbers of shape (time,), s")
-    targets: Any = checks.reals("positions", positions, "numbers of shape (time, particle, dim), m")
+    targets: Any = checks.reals(name, positions, f"numbers of shape {meaning}")
     if times.ndim != 1 or not len(times):
         raise ValueError(f"times must have shape (time,) with at least one time, got {times.shape}")
     if targets.shape != (len(times), *shape):
-        raise ValueError(
-            f"positions must have shape (time, particle, dim) = {(len(times), *shape)}, got {targets.shape}"
-        )
+        raise ValueError(f"{name} must have shape {meaning} = {(len(times), *shape)}, got {targets.shape}")
     if not np.isfinite(times).all():
         raise ValueError(f"times must be finite, got {times[~np.isfinite(times)][0]}; drop those rows")
     falls = np.flatnonzero(np.diff(times) < 0)

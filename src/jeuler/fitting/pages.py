@@ -14,7 +14,9 @@ from jeuler.forces import Springs
 
 if TYPE_CHECKING:
     from jeuler.fitting._springs import SpringFit
+    from jeuler.fitting.measured.task import Several
     from jeuler.fitting.recorded import Recorded
+    from jeuler.fitting.series import Series
     from jeuler.plotting.report import FitReport, Net, Parameter
 
 RECORDING = "recording"  # under this name what was fitted is kept beside a `SpringFit`
@@ -24,23 +26,26 @@ def page_of(found: SpringFit) -> FitReport:
     """The page of a fit, with the recording that it was made from."""
     from jeuler.plotting.report import FitReport
 
-    task: Recorded | None = attached(found, RECORDING)
+    task: Recorded | Several | None = attached(found, RECORDING)
     if task is None or task.traced:
         raise ValueError(
             "a report needs the fit as `fit_springs` gave it, with its data: "
             "a copy, and what comes out of jit or vmap, has none; fit again"
         )
-    count, particles, dim = np.shape(task.targets)
-    rows = list(_rows(found))
+    shown, rows = task.series(found.predicted), list(_rows(found))
+    several = len(shown.steps)
     return FitReport(
-        title=f"Fit of {len(rows)} parameter{'s' * (len(rows) > 1)} to {count} times",
+        title=f"Fit of {len(rows)} parameter{'s' * (len(rows) > 1)} to {len(shown.times) - several + 1} times"
+        + f" of {several} recordings" * (several > 1),
         verdict=found.message[:1].upper() + found.message[1:] + ".",
-        times=task.times,
-        observed=np.asarray(task.targets, float).reshape(count, -1),
-        predicted=np.asarray(found.predicted, float).reshape(count, -1),
-        names=[f"{'xyz'[d]}{k}" for k in range(particles) for d in range(dim)],
+        times=shown.times,
+        observed=shown.observed,
+        predicted=shown.predicted,
+        names=shown.names,
+        unit=shown.unit,
+        quantity=shown.quantity,
         parameters=rows,
-        facts=list(_facts(found, task)),
+        facts=list(_facts(found, shown, task.dt)),
         next_steps=list(next_steps(found)),
         correlation=None if found.covariance is None else ([row.name for row in rows], found.correlation),
         history=found.history,
@@ -66,15 +71,17 @@ def _rows(found: SpringFit) -> Iterator[Parameter]:
         yield Parameter(name, value, error, unit_of(name.split("[")[0], found.scene), "; ".join(notes))
 
 
-def _facts(found: SpringFit, task: Recorded) -> Iterator[tuple[str, str]]:
+def _facts(found: SpringFit, shown: Series, dt: float) -> Iterator[tuple[str, str]]:
     """The summary."""
-    residual = np.asarray(task.targets) - np.asarray(found.predicted)
-    yield (
-        "observed",
-        f"{int(np.isfinite(residual).sum())} coordinates from {task.times[0]:.5g} to {task.times[-1]:.5g} s",
-    )
-    yield "simulation", f"{task.prediction.num_steps} steps of {task.dt:.4g} s"
-    yield "residual, RMS", f"{np.sqrt(np.nanmean(residual**2)):.4g} m"
+    residual = shown.observed - shown.predicted
+    kind = "coordinates" if shown.quantity == "position" else "values"
+    span = f"{shown.times[0]:.5g} to {shown.times[-1]:.5g} s" + ", one after another" * (len(shown.steps) > 1)
+    yield "observed", f"{int(np.isfinite(residual).sum())} {kind} from {span}"
+    yield "simulation", f"{', '.join(map(str, shown.steps[:8]))}{' ...' * (len(shown.steps) > 8)} steps of {dt:.4g} s"
+    yield "residual, RMS", f"{np.sqrt(np.nanmean(residual**2)):.4g} {shown.unit}".rstrip()
+    if found.held_out_rms is not None:
+        yield "residual, RMS, of what was fitted", f"{found.training_rms:.4g} {shown.unit}".rstrip()
+        yield "residual, RMS, of what was held out", f"{found.held_out_rms:.4g} {shown.unit}".rstrip()
     if found.explained is not None:
         yield "variance explained", f"{100 * found.explained:.5g} %"
     if found.noise_ratio is not None:
@@ -123,6 +130,7 @@ def _net(found: SpringFit) -> Net | None:
         return np.concatenate([np.broadcast_to(np.asarray(getattr(s.at(0.0), field)), len(s.edges)) for s in springs])
 
     edges: Any = np.concatenate([np.asarray(s.edges) for s in springs])
-    pinned = np.isinf(np.broadcast_to(np.asarray(found.state.mass), len(found.state.position)))
+    state = found.state[0] if isinstance(found.state, tuple) else found.state
+    pinned = np.isinf(np.broadcast_to(np.asarray(state.mass), len(state.position)))
     values = {"ks [N/m]": each("ks"), "kd [N s/m]": each("kd")}
-    return Net(np.asarray(found.state.position), edges, values, pinned)
+    return Net(np.asarray(state.position), edges, values, pinned)

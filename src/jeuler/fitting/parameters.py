@@ -13,6 +13,7 @@ import numpy as np
 
 from jeuler._core import checks
 from jeuler._core.component import parameters_of, replace
+from jeuler.fitting.ties import Tie, checked_ties
 from jeuler.forces.springs import Springs
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -49,11 +50,20 @@ class Places:
     free: tuple[int, ...]
     pinned: tuple[int, ...]
     where: Callable[[Scene], Any] | None = None
+    ties: tuple[Tie, ...] = ()
 
     @classmethod
-    def of(cls, state: ParticleState, names: Any, where: Callable[[Scene], Any] | None) -> Places:
-        """The places of these names, or one ValueError."""
-        if isinstance(names, str) or not (names or where is not None):
+    def of(
+        cls,
+        state: ParticleState,
+        names: Any,
+        where: Callable[[Scene], Any] | None,
+        ties: Any = None,
+        scene: Scene | None = None,
+        least: int = 1,
+    ) -> Places:
+        """The places of these names, at least so many, or one ValueError; ties need the scene."""
+        if isinstance(names, str) or not (names or where is not None or not least):
             raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {names!r}')
         names = tuple(names)
         for name in names:
@@ -63,7 +73,23 @@ class Places:
                 raise ValueError(f"parameters must name each parameter once, got {name!r} {names.count(name)} times")
         can_move = np.broadcast_to(np.isfinite(np.asarray(state.mass)), state.position.shape[:1])
         free, pinned = (tuple(np.flatnonzero(mask).tolist()) for mask in (can_move, ~can_move))
-        return cls(names, free, pinned, where)
+        untied = cls(names, free, pinned, where)
+        if ties is None or scene is None:
+            return untied
+        return dataclasses.replace(untied, ties=checked_ties(ties, names, untied.read(scene, state)))
+
+    @property
+    def untied(self) -> Places:
+        """The same with every number an unknown of its own."""
+        return dataclasses.replace(self, ties=())
+
+    def reduced(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Parameters of `untied` with one number for those that are tied."""
+        return {**params, **{tie.name: tie.reduced(params[tie.name]) for tie in self.ties}}
+
+    def expanded(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Parameters as `untied` has them."""
+        return {**params, **{tie.name: tie.expanded(params[tie.name]) for tie in self.ties}}
 
     def rows(self, name: str) -> np.ndarray:
         """The particles whose values a name of the state speaks of."""
@@ -94,7 +120,7 @@ class Places:
         if self.where is not None:
             start[WHERE] = self._picked(scene)
         self._refuse_twice(scene)
-        return start
+        return self.reduced(start)
 
     def _picked(self, scene: Scene) -> Any:
         """What the function of the scene picks."""
@@ -123,6 +149,7 @@ class Places:
 
     def put(self, scene: Scene, state: ParticleState, params: dict[str, Any]) -> tuple[Scene, ParticleState]:
         """Scene and state with the parameters put in."""
+        params = self.expanded(params)
         forces = list(scene.forces)
         if self.where is not None:
             import equinox

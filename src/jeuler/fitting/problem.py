@@ -18,7 +18,7 @@ from jeuler._core.partition import OfArrays, arrays_only
 from jeuler._jax.programs import is_transformed
 from jeuler.fitting.evaluate import Evaluate, evaluations
 from jeuler.fitting.least_squares import Task
-from jeuler.fitting.priors import Priors
+from jeuler.fitting.priors import Alike, Priors
 from jeuler.fitting.unknowns import Layout, checked_bounds
 
 PyTree = Any
@@ -46,7 +46,9 @@ class FlatResidual:
 @functools.lru_cache(maxsize=32)
 def kept_programs(residual: FlatResidual) -> Evaluate:
     """The compiled programs of a residual that takes its data as an argument: used again by the next fit."""
-    return evaluations(residual, compiled=True)
+    function: Any = residual.residual
+    function = function.function if isinstance(function, OfArrays) else function
+    return evaluations(residual, compiled=True, haste=getattr(function, "haste", "none"))
 
 
 def programs(residual: FlatResidual, data: Any) -> Evaluate:
@@ -147,6 +149,7 @@ class Problem:
         stages: Iterable[PyTree] = (),
         priors: Any = None,
         loss: str = "linear",
+        alike: Alike | None = None,
     ) -> Problem:
         """From what the user passes, or one ValueError that says what is wrong with it."""
         layout = Layout.of(params)
@@ -165,7 +168,7 @@ class Problem:
             )
         weight = residual_weights(form, sigma, weights)
         masks = tuple(_stage(form, stage, weight) for stage in stages)
-        known = Priors.of(layout, priors, sigma, loss)
+        known = Priors.of(layout, priors, sigma, loss, alike)
         flat = FlatResidual(residual, layout, with_data, known)
         if known is not None:
             form = Layout.of({"data": shape, "priors": jax.ShapeDtypeStruct((1, len(known.places)), layout.dtype)})

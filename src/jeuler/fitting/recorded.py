@@ -25,10 +25,13 @@ from jeuler.fitting.observations import (
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.parameters import Places
 from jeuler.fitting.prediction import Prediction, compiled_positions, recording
+from jeuler.fitting.priors import Alike
 from jeuler.fitting.problem import Problem
-from jeuler.fitting.result import Fit
 from jeuler.fitting.sampling import aliased
+from jeuler.fitting.series import Columns, Series, column_names
+from jeuler.fitting.smoothness import alike_neighbours
 from jeuler.fitting.step_bias import bias_of_step
+from jeuler.fitting.two_starts import from_both
 from jeuler.fitting.unknowns import Layout
 from jeuler.fitting.weak_form import weak_form
 from jeuler.particles.scene import Scene
@@ -36,7 +39,6 @@ from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step
 
 POOR = 0.9  # share explained below which units and origins are looked at
-GOOD = 1.5  # times the noise: a residual below this leaves nothing to look for elsewhere
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Recorded:
         step: Step,
         names: Any,
         where: Any,
+        ties: Any = None,
     ) -> Recorded:
         """Checked, or one ValueError."""
         checks.kind("scene", scene, Scene)
@@ -91,7 +94,7 @@ class Recorded:
                 f"times must lie in the simulated span, {t0} to {t0 + num_steps * dt} s, got {times[-1]}; "
                 f"num_steps={needed} reaches it"
             )
-        places = Places.of(state, names, where)
+        places = Places.of(state, names, where, ties, scene)
         flat = targets.reshape(len(times), -1)
         observed = np.arange(flat.shape[1]) if checks.is_traced(targets) else np.isfinite(flat).any(axis=0).nonzero()[0]
         prediction = Prediction(places, step, num_steps, tuple(observed.tolist()))
@@ -125,6 +128,7 @@ class Recorded:
         stages: Any,
         priors: Any = None,
         loss: str = "linear",
+        alike: Alike | None = None,
     ) -> Problem:
         """The least-squares problem from this start."""
         data = self.data
@@ -161,30 +165,29 @@ class Recorded:
             stages=stages,
             priors=priors,
             loss=loss,
+            alike=alike,
         )
 
     def fit(
-        self, options: Options, bounds: Any, sigma: Any, weights: Any, start: str, grow: bool, priors: Any = None
+        self,
+        options: Options,
+        bounds: Any,
+        sigma: Any,
+        weights: Any,
+        start: str,
+        grow: bool,
+        priors: Any = None,
+        smoothness: Any = None,
     ) -> tuple[Outcome, str]:
         """Search from the data and, where that is not good, from the scene's values; the better, and its start."""
         stages = self._stages() if grow else ()
-        given = self.problem(self.start, bounds, sigma, weights, stages, priors, options.loss)
+        alike = alike_neighbours(self.scene, self.prediction.places, smoothness)
+        given = self.problem(self.start, bounds, sigma, weights, stages, priors, options.loss, alike)
         if self.traced:
             return run(given, options), "given"
         known, scale = self._known(given), self._scale()
-        begun = None
-        if start == "data":
-            begun = self._from_data(given)
-        if begun is None:
-            return run(given, options, scale=scale, known=known), "given"
-        best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
-        if _good(best.fit) or options.optimizer is not None:
-            return best, "data"
-        try:
-            other = run(given, dataclasses.replace(options, resume=None), scale=scale, known=known)
-        except ValueError:  # not finite at the given values: nothing to set against the other
-            return best, "data"
-        return (other, "given") if other.fit.loss < best.fit.loss * (1 - 1e-6) else (best, "data")
+        begun = self._from_data(given) if start == "data" else None
+        return from_both(given, begun, options, scale, known)
 
     def _from_data(self, given: Problem) -> Problem | None:
         """The same problem from what the weak form finds in the positions."""
@@ -222,6 +225,20 @@ class Recorded:
 
         return {name: sizes[name] if name in sizes else jax.tree.map(size, x) for name, x in self.start.items()}
 
+    def seen_whole(self, values: Any) -> Recorded:
+        """The same with what was held out, to be shown."""
+        return dataclasses.replace(self, targets=np.asarray(values, float))
+
+    def series_of_each(self, predicted: Any) -> list[Columns]:
+        """Times, measured and predicted columns."""
+        observed, shown = (np.asarray(y, float).reshape(len(self.times), -1) for y in (self.targets, predicted))
+        return [(self.times, observed, shown)]
+
+    def series(self, predicted: Any) -> Series:
+        """What was measured beside what was predicted."""
+        names = column_names("position", np.shape(self.targets)[1:], None)
+        return Series(*self.series_of_each(predicted)[0], names, "position", "m", [self.prediction.num_steps])
+
     def completed(self, outcome: Outcome, step_bias: bool) -> tuple[dict[str, Any], Any, Scene, ParticleState, Array]:
         """What a `SpringFit` has beside the `Fit`: the bias of the step, scene, state and prediction."""
         found = outcome.fit
@@ -254,12 +271,3 @@ def _refuse_stillness(targets: Any) -> None:
     first = np.where(seen, targets, 0)[np.argmax(seen, axis=0), *np.indices(seen.shape[1:])]
     if seen.any() and np.any(first[seen.any(axis=0)]) and np.all(np.where(seen, targets, first) == first):
         raise ValueError("positions must move, got the same ones at all times; give a recording of a motion")
-
-
-def _good(found: Fit) -> bool:
-    """Whether the fit leaves nothing to look for from another start."""
-    if not found.converged:
-        return False
-    if found.noise_ratio is not None and found.noise_ratio <= GOOD:
-        return True
-    return found.explained is not None and found.explained > 0.99

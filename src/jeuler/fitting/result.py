@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
 
 from jeuler._core.component import result
 from jeuler.fitting._tables import fit_table
@@ -14,6 +15,7 @@ from jeuler.fitting.beside import attached
 from jeuler.fitting.profiles import AGAIN, Profile
 
 PyTree = Any
+DENSITY = "log-density"  # under this name a `Density` is kept beside a result
 
 
 @result
@@ -97,6 +99,36 @@ class Fit:
         if again is None:
             raise ValueError("a profile needs the fit as `fit` gave it, with standard errors; fit again")
         return again.profile(name, float(norm.ppf((1 + level) / 2)))
+
+    def log_density(self, params: PyTree) -> Array:
+        """The logarithm of the density of parameters given the data and priors, up to a constant: for samplers.
+
+            log p = -1/2 sum over k of rho(r_k(p) / sigma_k) + constant,   -inf outside the bounds
+
+        It is made of JAX's operations, to be traced, differentiated and batched. Where no sigma was given, that of the
+        residual of the best fit is taken. Noise counts as independent: for residuals that are correlated the density
+        is too narrow, as `stderr_white` is against `stderr`.
+
+        Args:
+          params: of the structure of ``.params``.
+        Returns: a number, ().
+        Raises: ValueError, if params have another structure, or the fit was copied, traced, or made by an optax
+          optimiser or for more than 500 unknowns.
+        Example:
+          >>> import jax, jax.numpy as jnp, jeuler
+          >>> x = jnp.linspace(0.0, 1.0, 11)
+          >>> found = jeuler.fit(lambda p: p["slope"] * x - 3 * x, {"slope": 1.0}, sigma=0.1)
+          >>> density = found.log_density
+          >>> round(float(density({"slope": 3.1}) - density({"slope": 3.0})), 3)  # -1/2 sum of x^2
+          -1.925
+        """
+        density = attached(self, DENSITY)
+        if density is None:
+            raise ValueError(
+                "log_density needs the fit as `fit` or `fit_springs` gave it by Levenberg-Marquardt, of at most 500 "
+                "unknowns; a copy, and what comes out of jit or vmap, has none; fit again"
+            )
+        return density(params)
 
     @property
     def correlation(self) -> Any:

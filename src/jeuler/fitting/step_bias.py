@@ -31,13 +31,20 @@ def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[st
     Returns: fitted minus what an exact integrator would give, of the structure of the params; and sentences.
     Source: the extrapolation of L. F. Richardson; the projection is the Gauss-Newton step.
     """
+    whole, half = _residuals(task, Layout.of(found.params), found)
+    return shifted(whole, half, task.dt, task.prediction.step, found, state)
+
+
+def shifted(
+    whole: np.ndarray, half: np.ndarray, dt: float, step: Any, found: Fit, state: State
+) -> tuple[Any, list[str]]:
+    """`bias_of_step` from the residuals in steps of dt and of dt / 2."""
     layout = Layout.of(found.params)
-    whole, half = _residuals(task, layout, found)
     if not np.isfinite(half).all():
-        return None, [f"at dt = {task.dt / 2:g} the run is not finite, so the bias of the step is not known"]
+        return None, [f"at dt = {dt / 2:g} the run is not finite, so the bias of the step is not known"]
     with np.errstate(all="ignore"):
         weights = np.where(whole != 0, state.residual[: len(whole)] / whole, 0)
-    order = getattr(task.prediction.step, "order", 1)
+    order = getattr(step, "order", 1)
     jump = 2**order / (2**order - 1)
     change = np.zeros(len(state.residual))  # that of the rows of priors is 0
     change[: len(whole)] = (half - whole) * jump * weights
@@ -48,11 +55,11 @@ def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[st
     worst = int(np.argmax(share)) if share.size else 0
     if not share.size or share[worst] <= TENTH:
         return bias, []
-    advised = task.dt * min((TENTH / share[worst]) ** (1 / order), 0.5)
+    advised = dt * min((TENTH / share[worst]) ** (1 / order), 0.5)
     exponent = np.floor(np.log10(advised))
     advised = np.floor(advised / 10 ** (exponent - 1)) * 10 ** (exponent - 1)
     return bias, [
-        f"the integrator's error at dt = {task.dt:g} moves {layout.names(readable)[worst]} by {shift[worst]:.2g}, "
+        f"the integrator's error at dt = {dt:g} moves {layout.names(readable)[worst]} by {shift[worst]:.2g}, "
         f"{share[worst]:.2g} standard errors (.step_bias): use dt = {advised:.2g}"
     ]
 

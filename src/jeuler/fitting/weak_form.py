@@ -104,6 +104,9 @@ def weak_form(
     scene: Scene, state: ParticleState, times: np.ndarray, targets: np.ndarray, places: Places, start: dict[str, Any]
 ) -> WeakForm | None:
     """The parameters from the tracks; None where these say nothing: too few samples, or nothing enters linearly."""
+    if places.ties:
+        untied = weak_form(scene, state, times, targets, places.untied, places.expanded(start))
+        return None if untied is None else dataclasses.replace(untied, params=places.reduced(untied.params))
     tracks = smoothed(times, targets)
     if tracks is None or any(declared(force, "reads") for force in scene.forces):
         return None

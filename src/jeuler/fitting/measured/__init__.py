@@ -1,0 +1,1 @@
+"""Recordings of any sensor, one or several, as one least-squares problem."""
