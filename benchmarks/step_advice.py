@@ -1,6 +1,9 @@
 """advise_step over its steps, problems, spring scenes and switched fields: achieved error against target.
 
-    python benchmarks/step_advice.py [problems | scenes | switched] [--part NAME] [--steps euler rk4] [--targets 1e-2]
+    python benchmarks/step_advice.py [all | problems | scenes | switched] [--log FILE] [--part NAME] [--steps euler rk4]
+
+Each answer is printed as it comes. With --log FILE it is kept there too, as one line of JSON, and a run that was cut
+off goes on after the last of them.
 
 Errors are relative, |y - reference| / |reference| at t1, in float64. References: published end values; for scenes, runs
 of `solve_adaptive` at rtol 1e-12; for fields that switch or kink, exact solutions written out piece by piece. Every
@@ -11,11 +14,13 @@ answer is run that advances at most 3e9 numbers (3e7 where a step solves equatio
   with dt 1 % larger;
 - "with one step fewer": that run misses the target;
 - linearly implicit steps named: their run meets the target;
+- "no larger dt": as for stability; the answer then counts as the least number of steps, not as too many;
 - refused for stability: a run of half the steps that it asks for is lost or misses the target.
 """
 
 import argparse
 import collections
+import json
 import math
 import pathlib
 import re
@@ -44,6 +49,8 @@ STEPS = {
 }
 LONGEST, LONGEST_IMPLICIT = 3e9, 3e7  # numbers advanced
 ABOVE, FACTOR = 1.1, 3.0
+PARTS = "scenes", "switched", "problems"
+KEY = "part", "problem", "step", "target"
 
 
 class Runs:
@@ -76,7 +83,8 @@ def false_reason(advice, runs, linear, target):
         return "neither confirmed nor predicted"
     if "with one step fewer" in reason and runs(advice.num_steps - 1) <= 0.8 * target:
         return "one step fewer would do"
-    if "stability, not" in reason and larger_would_do(runs, advice.num_steps, 0.8 * target):
+    largest = "stability, not" in reason or "no larger dt" in reason
+    if largest and larger_would_do(runs, advice.num_steps, 0.8 * target):
         return "a larger dt would do"
     return ""
 
@@ -89,15 +97,14 @@ def false_refusal(advice, runs, target, longest):
     return ""
 
 
-def check(tally, title, problem, args, step_name, target):
-    """One answer: a line printed, and counted."""
+def check(part, title, problem, args, step_name, target):
+    """One answer, as a dictionary."""
     step = STEPS[step_name]
     runs = Runs(problem, args, step)
     linear = Runs(problem, args, jeuler.linearly_implicit_euler_step)
     begun = time.process_time()
     advice = jeuler.advise_step(problem.f, problem.y0, t0=problem.t0, t1=problem.t1, args=args, error=target, step=step)
     seconds = time.process_time() - begun
-    tally["seconds"].append(seconds)
     explicit = hasattr(getattr(step, "base", step), "increment")
     longest = (LONGEST if explicit else LONGEST_IMPLICIT) / np.size(problem.reference)
     ratio, wrong = math.nan, ""
@@ -107,58 +114,99 @@ def check(tally, title, problem, args, step_name, target):
         kind = "not run"
     else:
         ratio, wrong = runs(advice.num_steps) / target, false_reason(advice, runs, linear, target)
-        bound = "stability, not" in advice.reason or "one step" in advice.reason
-        kind = (
-            "above" if ratio > ABOVE else "near" if ratio >= 1 / FACTOR else "bound" if bound and not wrong else "far"
-        )
-    tally[kind].append(ratio)
-    tally["false"] += [wrong] * bool(wrong)
-    print(
-        f"{title:22s} {step_name:17s} {target:.0e} {ratio:6.2f} {kind:8s}{seconds:5.1f} s  {advice.reason}", flush=True
-    )
+        kind = kind_of(ratio, advice.reason, wrong)
+    key = dict(zip(KEY, (part, title, step_name, target), strict=True))
+    return key | {"kind": kind, "ratio": ratio, "seconds": seconds, "wrong": wrong, "reason": advice.reason}
+
+
+def kind_of(ratio, reason, wrong):
+    """Where an answer that was run stands."""
+    if ratio > ABOVE:
+        return "above"
+    if ratio >= 1 / FACTOR:
+        return "near"
     if wrong:
-        print(f"{'':40s}FALSE: {wrong}", flush=True)
+        return "far"
+    if "stability, not" in reason or "one step" in reason:
+        return "bound"
+    return "least" if "no larger dt" in reason else "far"
 
 
-def report(tally):
-    run = [ratio for kind in ("above", "near", "bound", "far") for ratio in tally[kind]]
-    free = len(tally["near"]) + len(tally["far"]) + len(tally["above"])
+def show(answer):
     print(
-        f"{len(run)} answers run, {len(tally['not run'])} too long to run, {len(tally['refused'])} refused; "
-        f"the largest error is {max(run, default=math.nan):.2f} of its target, {len(tally['above'])} above {ABOVE}; "
-        f"where neither stability nor one step more decides, {len(tally['near'])} of {free} are within a factor "
-        f"{FACTOR:g}, {len(tally['near']) / max(1, free):.1%}; {len(tally['false'])} false reasons; "
-        f"CPU seconds an answer: median {np.median(tally['seconds']):.1f}, longest {max(tally['seconds']):.1f}"
+        f"{answer['problem']:22s} {answer['step']:17s} {answer['target']:.0e} {answer['ratio']:6.2f} "
+        f"{answer['kind']:8s}{answer['seconds']:5.1f} s  {answer['reason']}",
+        flush=True,
     )
+    if answer["wrong"]:
+        print(f"{'':40s}FALSE: {answer['wrong']}", flush=True)
+
+
+def report(title, answers):
+    """One paragraph of counts."""
+    count = collections.Counter(answer["kind"] for answer in answers)
+    run = [answer["ratio"] for answer in answers if answer["kind"] in ("above", "near", "bound", "least", "far")]
+    seconds = [answer["seconds"] for answer in answers]
+    free = count["near"] + count["far"] + count["above"]
+    print(
+        f"{title}: {len(run)} answers run, {count['not run']} too long to run, {count['refused']} refused; the largest "
+        f"error is {max(run, default=math.nan):.2f} of its target, {count['above']} above {ABOVE}; stability or one "
+        f"step more decides {count['bound']}, no larger dt does in {count['least']} more; of the others "
+        f"{count['near']} of {free} are within a factor {FACTOR:g}, {count['near'] / max(1, free):.1%} (with those "
+        f"{count['least']} {count['near'] / max(1, free + count['least']):.1%}); "
+        f"{sum(bool(answer['wrong']) for answer in answers)} false reasons; CPU seconds an answer: median "
+        f"{np.median(seconds):.1f}, longest {max(seconds):.1f}"
+    )
+
+
+def cases_of(part):
+    """{name: (problem, args)}, and the names of its steps."""
+    if part == "scenes":
+        cases = {name: (Published(f, y0, 0.0, t1, end), args) for name, (f, y0, t1, args, end) in spring_scenes()}
+        return cases, ["symplectic", "rk4"]
+    if part == "switched":
+        cases = {
+            name: (Published(f, jnp.asarray(y0, float), 0.0, t1, np.atleast_1d(end)), None)
+            for name, (f, y0, t1, end) in FIELDS.items()
+        }
+        return cases, ["euler", "heun", "rk4", "extrapolated"]
+    cases = {name: (problem, None) for name, problem in {**problems_in(), **more_problems()}.items()}
+    return cases, [name for name in STEPS if name != "symplectic"]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", nargs="?", choices=("problems", "scenes", "switched"), default="problems")
+    parser.add_argument("what", nargs="?", choices=("all", *PARTS), default="all")
+    parser.add_argument("--log", type=pathlib.Path, default=None, help="file of answers, gone on with if it is there")
     parser.add_argument("--part", default="", help="only those with this in their name; several by commas")
     parser.add_argument("--steps", nargs="+", choices=list(STEPS), default=None)
     parser.add_argument("--targets", type=float, nargs="+", default=[1e-2, 1e-4])
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    if given.what == "scenes":
-        cases = {name: (Published(f, y0, 0.0, t1, end), args) for name, (f, y0, t1, args, end) in spring_scenes()}
-        steps = given.steps or ["symplectic", "rk4"]
-    elif given.what == "switched":
-        cases = {
-            name: (Published(f, jnp.asarray(y0, float), 0.0, t1, np.atleast_1d(end)), None)
-            for name, (f, y0, t1, end) in FIELDS.items()
-        }
-        steps = given.steps or ["euler", "heun", "rk4", "extrapolated"]
-    else:
-        cases = {name: (problem, None) for name, problem in {**problems_in(), **more_problems()}.items()}
-        steps = given.steps or [name for name in STEPS if name != "symplectic"]
-    tally = collections.defaultdict(list)
-    for name, (problem, args) in cases.items():
-        if any(part in name for part in given.part.split(",")):
-            for step_name in steps:
+    log, known = given.log, {}
+    if log is not None and log.exists():
+        known = {tuple(a[k] for k in KEY): a for a in map(json.loads, log.read_text().splitlines())}
+    answers = []
+    for part in PARTS if given.what == "all" else [given.what]:
+        cases, steps = cases_of(part)
+        for name, (problem, args) in cases.items():
+            if not any(each in name for each in given.part.split(",")):
+                continue
+            for step_name in given.steps or steps:
                 for target in given.targets:
-                    check(tally, name, problem, args, step_name, target)
-    report(tally)
+                    answer = known.get((part, name, step_name, target))
+                    if answer is None:
+                        answer = check(part, name, problem, args, step_name, target)
+                        if log is not None:
+                            with log.open("a") as file:
+                                print(json.dumps(answer), file=file)
+                    show(answer)
+                    answers.append(answer)
+    for part in PARTS:
+        if chosen := [answer for answer in answers if answer["part"] == part]:
+            report(part, chosen)
+    if answers:
+        report("all", answers)
 
 
 if __name__ == "__main__":

@@ -200,15 +200,36 @@ def test_known_breaks_let_high_orders_do_with_few_steps():
 
 
 def test_stiff_problems_are_answered_or_told_what_meets_the_target():
-    """Oregonator: no explicit step is advised, and the run that is named instead meets the target."""
+    """Oregonator: where pilot runs are too short for an explicit step, the run that is named meets the target."""
     f, y0, t0, t1, reference = more_problems()["OREGO"]
-    advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2, step=jeuler.rk4_step)
+    advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2, step=jeuler.rk4_step, max_pilot_steps=2**21)
     assert not advice.feasible
     assert "stability alone asks for dt <=" in advice.reason
     assert "extrapolated_euler(6, step=linearly_implicit_euler_step)" in advice.reason
     step = jeuler.extrapolated_euler(6, step=jeuler.linearly_implicit_euler_step)
     run = jeuler.solve_adaptive(f, y0, t0=t0, t1=t1, rtol=1e-6, atol=1e-6, step=step)
     assert np.linalg.norm(run.y[-1] - reference) < 1e-2 * np.linalg.norm(reference)
+
+
+def test_van_der_pol_that_stability_asks_millions_of_steps_for_is_answered():
+    f, y0, t0, t1, reference = more_problems()["VDPOL_mu1000"]
+    advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2, step=jeuler.rk4_step)
+    assert advice.feasible, advice.reason
+    final = Pilot(f, y0, t0, t1, None, jeuler.rk4_step, np.float64, False)(advice.num_steps)[-1]
+    assert 1e-2 / 3 < distance(final, reference) / np.linalg.norm(reference) <= 1e-2
+
+
+def test_an_answer_is_no_accident_of_where_the_jumps_fall_on_the_grid():
+    """300 steps meet the target 51 times over, as every second of a field that switches each second is a step; 299 miss
+    it. The answer is near the target instead."""
+    f, y0, t1, end = FIELDS["driven"]
+    run = Pilot(f, jnp.asarray(y0), 0.0, t1, None, jeuler.euler_step, np.float64, False)
+    error = lambda n: abs(run(n)[-1, 0] / end - 1)  # noqa: E731
+    assert error(300) < 3e-4
+    assert error(299) > 1e-2
+    advice = advise_step(f, y0, t1=t1, error=1e-2)
+    assert 1e-2 / 3 < error(advice.num_steps) <= 1e-2
+    assert advice.num_steps < 390
 
 
 def test_an_eccentric_orbit_is_answered():

@@ -168,3 +168,39 @@ def test_bad_breaks_are_told(breaks, message):
     ):
         with pytest.raises(ValueError, match=message):
             run()
+
+
+@pytest.mark.parametrize("step", [None, jeuler.extrapolated_euler(6)])
+def test_what_is_shorter_than_the_longest_gap_may_be_missed_and_longest_steps_end_that(step):
+    """Pulses of 0.03 s at 57 times: a wrong answer has a gap longer than the pulse; with max_dt there is none."""
+    pulse, times, right = 0.03, np.linspace(0.3, 1.7, 57), np.exp(-RATE * 1.97)
+    f = lambda t, y, time: -jnp.where((t > time) & (t <= time + pulse), 0.0, RATE) * y  # noqa: E731
+    run = jax.jit(jax.vmap(lambda time, rtol, max_dt: jeuler.solve_adaptive(
+        f, 1.0, t1=2.0, args=time, rtol=rtol, atol=1e-3 * rtol, step=step, max_dt=max_dt
+    ), in_axes=(0, None, None)))  # fmt: skip
+    missed = 0
+    for rtol in (1e-4, 1e-6):
+        free = run(times, rtol, 10.0)
+        wrong = np.abs(free.y[:, -1] / right - 1) > 100 * rtol
+        assert np.all(free.longest_gap[wrong] > pulse)
+        missed += wrong.sum()
+        bound = run(times, rtol, 0.95 * pulse / (0.3 if step is None else 1 / step.order))
+        assert np.all(bound.finished)
+        assert np.all(bound.longest_gap < pulse)
+        assert np.max(np.abs(bound.y[:, -1] / right - 1)) < 100 * rtol
+    assert missed > 0
+
+
+def test_no_look_at_f_is_further_from_the_next_than_the_longest_gap():
+    for step in (None, jeuler.extrapolated_euler(3), jeuler.extrapolated_euler(4, step=jeuler.implicit_euler_step),
+                 jeuler.extrapolated_euler(5, step=jeuler.linearly_implicit_euler_step)):  # fmt: skip
+        seen = []
+
+        def field(t, y, args, seen=seen):
+            jax.debug.callback(lambda t: seen.append(float(t)), t)
+            return -y
+
+        run = jeuler.solve_adaptive(field, 1.0, t1=3.0, step=step, max_dt=0.7, dt0=0.7, rtol=1e-3)
+        jax.effects_barrier()
+        assert np.max(np.diff(np.unique([*seen, 0.0, 3.0]))) <= float(run.longest_gap) * (1 + 1e-9)
+        assert float(run.longest_gap) <= 0.7 * (0.3 if step is None else 1 / step.order) * (1 + 1e-6)

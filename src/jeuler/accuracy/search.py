@@ -31,12 +31,14 @@ REGULAR = 0.25  # and the observed order be this close to the step's own, to pre
 OFF = 0.93, 0.79, 0.61  # parts of the finest rung: numbers of steps that share no pattern with it
 EVEN = 2.5  # times the error that the order of the step tells of them
 BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
-FINER = 1.1  # from one number of steps to the next where errors are uneven
+ACCIDENT = 1.3  # times the fewest steps at most, for an error that is no accident of the grid
+FINER, FINE = 1.1, 1.02  # from one number of steps to the next where errors are uneven, many or few
 REFERENCE_RTOL = 1e-8, 1e-11, 1e-13  # of adaptive runs; the first that agrees with the one before is the reference
 REFERENCE_STEPS, STIFF_REFERENCE_STEPS = 65_536, 8_192
 STIFF_STEP = extrapolated_euler(6, step=linearly_implicit_euler_step)
 STIFF_WORDS = "solve_adaptive with step=extrapolated_euler(6, step=linearly_implicit_euler_step)"
 NEAR_ENOUGH = 4  # an answer of up to this part of the longest pilot run is run itself, not predicted
+DOUBLINGS = 64  # times the steps that stability asks for, to see how the error falls from there on
 ROUGH = 2**18  # steps of the longest run in float32
 
 
@@ -65,7 +67,8 @@ class Search:
     error: float
     relative: bool
     compensated: bool
-    most: int
+    planned: int  # steps of the longest pilot run
+    ceiling: int  # of one where stability asks for so many
     breaks: tuple[float, ...]
     disagreeing: bool  # whether adaptive runs came to different ends
     interval: float
@@ -89,10 +92,12 @@ class Search:
         relative: bool,
         compensated: bool,
         most: int,
+        ceiling: int = 0,
         breaks: tuple[float, ...] = (),
     ) -> None:
         self.f, self.start, self.t0, self.t1, self.args, self.step = f, y0, t0, t1, args, step
-        self.error, self.relative, self.compensated, self.most = error, relative, compensated, most
+        self.error, self.relative, self.compensated = error, relative, compensated
+        self.planned, self.ceiling = most, max(most, ceiling)
         self.breaks, self.disagreeing = breaks, False
         self.interval = t1 - t0
         self.order = int(getattr(step, "order", 1))
@@ -106,6 +111,13 @@ class Search:
 
     def runs(self, step: Step, dtype: Any, compensated: bool) -> Pilot:
         return Pilot(self.f, self.start, self.t0, self.t1, self.args, step, dtype, compensated, self.breaks)
+
+    @property
+    def most(self) -> int:
+        """Steps of the longest pilot run: more than planned where a few doublings of what stability asks for are."""
+        if not self.bound > 0:
+            return self.planned
+        return int(min(self.ceiling, max(self.planned, DOUBLINGS * self.interval / self.bound)))
 
     def scale(self, final: Any) -> float:
         """The unit of the target, in the units of the state."""
@@ -125,9 +137,24 @@ class Search:
                     continue  # a Jacobian that is not finite; the pilots will show what happens there
                 self.stability, self.bound = min(self.stability, limit), min(self.bound, bound)
 
-    def climb(self, num_steps: int) -> Ladder | None:
+    def confirmed(self, start: int) -> tuple[Ladder | None, bool]:
+        """The ladder from so many steps on, as far as it was climbed, and whether it is even.
+
+        Errors that are only predicted, from runs too coarse to bear the checks, are looked at again on finer ones.
+        """
+        ladder = self.climb(start)
+        while ladder is not None and not self.even(ladder):
+            if ladder.errors()[-1] <= self.target(ladder):
+                return ladder, False
+            finer = self.climb(2 * ladder.num_steps[-1], ladder)
+            if finer is None:
+                return ladder, False
+            ladder = finer
+        return ladder, ladder is not None
+
+    def climb(self, num_steps: int, ladder: Ladder | None = None) -> Ladder | None:
         """Double the steps until the finest run's error is known, and meets the target or follows the order."""
-        ladder, looked = Ladder(self.order), False
+        ladder, looked = Ladder(self.order) if ladder is None else ladder, False
         while num_steps <= self.most:
             states = self.pilot(num_steps)
             ladder.add(num_steps, states[-1])
@@ -194,7 +221,11 @@ class Search:
             low, error_low = high, math.inf
             high *= 2
             error_high = error_of(high)
-        while error_high < NEAR * aim and high - low > max(1, FINENESS * high) and spent < 8 * self.most:
+        while (
+            error_high < NEAR * aim
+            and high - low > max(1, FINENESS * high)
+            and spent < max(8 * self.planned, 2 * self.most)
+        ):
             part = 0.5
             if math.isfinite(error_low):  # log-log interpolation, kept off the ends
                 part = math.log(error_low / (0.93 * aim)) / math.log(error_low / error_high)
@@ -252,7 +283,7 @@ class Search:
                         step=step,
                         rtol=rtol,
                         atol=rtol * size,
-                        max_steps=min(most, max(256, self.most // 8)),
+                        max_steps=min(most, max(256, self.planned // 8)),
                         breaks=self.breaks,
                     )
                     states = flat_rows(run.y)[1:]
@@ -267,25 +298,34 @@ class Search:
         return None
 
     def uneven(self, final: np.ndarray, start: int = 0) -> tuple[int, float] | None:
-        """The fewest steps of a scan, 10 % and then 1 % apart, whose own run meets the aim, with runs beside it near.
+        """The fewest steps of a scan whose own run meets the aim, with runs beside it near.
 
-        It begins at a quarter of the steps that stability asks for, or at ``start``.
+        The numbers of steps are 2 % apart where these are few, and else 10 % and then 1 %. They begin at a quarter of
+        what stability asks for, half if that is many, or at ``start``. Where an error is far below the target while
+        runs beside it are above, the jumps happen to fall well on that grid: up to 30 % more steps are looked at for a
+        run whose error is no such accident.
         """
-        aim, least = AIM, start or max(1, math.floor(self.interval / self.bound / 4))
+        many = self.most > self.planned
+        least = start or max(1, math.floor(self.interval / self.bound / (2 if many else 4)))
         error_of = functools.cache(functools.partial(self.error_after, final=final))
-        beside = lambda n: (max(1, round(n * part)) for part in BESIDE)  # noqa: E731
-        meets = lambda n: error_of(n) <= aim and all(error_of(m) <= FACTOR for m in beside(n))  # noqa: E731
+        beside = lambda n: [error_of(max(1, round(n * part))) for part in BESIDE]  # noqa: E731
+        meets = lambda n: error_of(n) <= AIM and max(beside(n)) <= FACTOR  # noqa: E731
+        near = lambda n: error_of(n) >= 1 / FACTOR and meets(n)  # noqa: E731
         num_steps, spent = least, 0
         while num_steps <= self.most and spent <= 2 * self.most:
             if meets(num_steps):
                 break
             spent += num_steps
-            num_steps = max(num_steps + 1, round(FINER * num_steps))
+            finer = FINE if num_steps <= self.planned // 64 else FINER
+            num_steps = max(num_steps + 1, round(finer * num_steps))
         else:
             return None
-        if error_of(num_steps) < 1 / FACTOR and num_steps <= self.most // 16:
-            between = np.linspace(num_steps / FINER, num_steps, 10)
-            num_steps = next((n for n in map(math.ceil, between) if n >= least and meets(n)), num_steps)
+        fewer = [n for n in map(math.ceil, np.linspace(num_steps / FINER, num_steps, 10)) if n >= least]
+        if error_of(num_steps) < 1 / FACTOR and not many:
+            num_steps = next((n for n in fewer if meets(n)), num_steps)
+        if error_of(num_steps) < 1 / FACTOR and max(beside(num_steps)) > 1:
+            more = [*fewer, *np.ceil(num_steps * np.linspace(1.01, ACCIDENT, 30)).astype(int).tolist()]
+            num_steps = next((n for n in more if n <= self.most and near(n)), num_steps)
         return num_steps, error_of(num_steps) * self.error * self.scale(final)
 
     def error_after(self, num_steps: int, final: np.ndarray) -> float:
@@ -297,7 +337,7 @@ class Search:
         """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that few."""
         run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.error * self.scale(final)
         num_steps, met = 1, False
-        while num_steps < min(fewer_than, self.most // 64):
+        while num_steps < min(fewer_than, self.planned // 64):
             before, met = met, distance(run(num_steps)[-1], final) <= aim
             if before and met:  # twice running: no accident
                 return num_steps // 2

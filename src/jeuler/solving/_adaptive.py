@@ -37,6 +37,8 @@ class AdaptiveSolution:
       error: sum of the estimated errors of the accepted steps, of the structure of y: what the run knows of its own
         error, before the equation damps or amplifies it; its derivative is 0.
       finished: whether the last time was reached within max_steps; if not, the states from there on are NaN.
+      longest_gap: the longest time between two looks at f in the accepted steps, s. What f does in between for less
+        than that may have left no trace in states and error.
     Example:
       >>> import jeuler
       >>> run = jeuler.solve_adaptive(lambda t, y, args: -y, 1.0, t1=1.0, max_steps=2, dt0=0.1)
@@ -50,6 +52,7 @@ class AdaptiveSolution:
     num_rejected: Array
     error: PyTree
     finished: Array
+    longest_gap: Array
 
     _repr_html_ = adaptive_table
 
@@ -66,6 +69,7 @@ def solve_adaptive(
     rtol: float = 1e-6,
     atol: float = 1e-9,
     dt0: Any = None,
+    max_dt: Any = None,
     max_steps: int = 16_384,
     breaks: Any = (),
 ) -> AdaptiveSolution:
@@ -78,8 +82,9 @@ def solve_adaptive(
     step after a rejected one: f may jump there. The new dt is for the c of the next step.
 
     Every step sees f at its end, and the method of Tsitouras also at 0.16, 0.33, 0.6 and 0.9 of it, so that a jump
-    shows in the error. Two that undo each other within a third of a step can lie between these times and leave no
-    trace: name such times in ``breaks``.
+    shows in the error. Not seen is what lasts for less than 0.3 of a step and lies between these times, such as a short
+    push: the run is then that without it, and its error says nothing of it. `AdaptiveSolution.longest_gap` says how
+    long that may be. With ``max_dt`` no gap is longer than 0.3 max_dt; times that are known belong into ``breaks``.
 
     A bounded loop: nested scans whose unused parts are skipped, so jit, vmap, jacfwd and reverse-mode grad work (each
     block is computed again on the way back). The derivative is that of the steps taken; their sizes count as given.
@@ -96,6 +101,7 @@ def solve_adaptive(
       rtol: error allowed in a step, relative to the state.
       atol: error allowed in a step, in units of the state.
       dt0: first step to try, s; None guesses from the size of y0 and its slope.
+      max_dt: longest step to take, s; None sets no bound.
       max_steps: most steps, rejected ones included, from one of the times or breaks to the next.
       breaks: times at which f may jump, (break,), s: a step ends there, f is evaluated just before the end of it and
         just after the start of the next. Differentiable.
@@ -131,10 +137,12 @@ def solve_adaptive(
             f"t1 must not be before t0={float(t0)}, and must increase, got {np.asarray(times).tolist()}; backwards in "
             f"time goes solve with a negative dt"
         )
-    if dt0 is not None:
-        checks.positive("dt0", dt0, "s")
+    for name, size in (("dt0", dt0), ("max_dt", max_dt)):
+        if size is not None:
+            checks.positive(name, size, "s")
     f, args = arrays_only(f, args)
-    inputs = Function(f), y0, args, times, t0, dt0, rtol, atol, checked_breaks(breaks, times.dtype), Function(chosen)
+    known = checked_breaks(breaks, times.dtype)
+    inputs = Function(f), y0, args, times, t0, dt0, max_dt, rtol, atol, known, Function(chosen)
     return programs.call(_solve_adaptive, inputs, (max_steps,))
 
 
@@ -145,6 +153,7 @@ def _solve_adaptive(
     times: Array,
     t0: Array,
     dt0: Any,
+    max_dt: Any,
     rtol: Any,
     atol: Any,
     breaks: Array,
@@ -157,6 +166,9 @@ def _solve_adaptive(
     times = jnp.where(_in_order(t0, times), times, jnp.nan)
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
+    if max_dt is not None:
+        max_dt = lax.stop_gradient(jnp.asarray(max_dt, times.dtype))
+        dt0 = jnp.minimum(dt0, max_dt)
 
     stops = jnp.concatenate([times, jnp.clip(breaks, t0, times[-1])])
     order = jnp.argsort(stops)
@@ -170,17 +182,19 @@ def _solve_adaptive(
             at = at._replace(taken_over=step.start(here, begin, at.y, args))
         at = at._replace(failed=jnp.asarray(False))
         most = at.tried + max_steps
+        attempt = lambda at: _try_step(step, here, args, end, at, max_dt, rtol, atol)  # noqa: E731
         going = lambda at: (at.t < end) & (at.tried < most)  # noqa: E731
-        at = bounded_while(going, lambda at: _try_step(step, here, args, end, at, rtol, atol), at, max_steps)
+        at = bounded_while(going, attempt, at, max_steps)
         reached = at.t >= end
         return at, (jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), at.y), reached)
 
     none, no_error = jnp.int32(0), jax.tree.map(jnp.zeros_like, y0)
     taken_over, dt0 = step.start(f, t0, y0, args), jnp.asarray(dt0, times.dtype)
-    start = _Progress(t0, y0, taken_over, dt0, no_error, none, none, jnp.asarray(False))
+    start = _Progress(t0, y0, taken_over, dt0, no_error, none, none, jnp.asarray(False), jnp.zeros((), times.dtype))
     end, (y, reached) = lax.scan(to_time, start, (jnp.append(t0, stops[:-1]), stops))
     y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[asked]]), y0, y)
-    return AdaptiveSolution(jnp.append(t0, times), y, end.accepted, end.tried - end.accepted, end.error, reached[-1])
+    counts, gap = (end.accepted, end.tried - end.accepted), end.longest * getattr(step, "gap", 1.0)
+    return AdaptiveSolution(jnp.append(t0, times), y, *counts, end.error, reached[-1], gap)
 
 
 class _Progress(NamedTuple):
@@ -194,9 +208,12 @@ class _Progress(NamedTuple):
     accepted: Array  # steps
     tried: Array  # steps
     failed: Array  # whether the last step was rejected
+    longest: Array  # accepted step, s
 
 
-def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Progress, rtol: Any, atol: Any) -> _Progress:
+def _try_step(
+    step: Any, f: VectorField, args: PyTree, end: Array, at: _Progress, max_dt: Any, rtol: Any, atol: Any
+) -> _Progress:
     """A step, taken if its error is within tolerance, and the size of the next; not past ``end``."""
     last = at.t + at.dt * (1 + 1e-3) >= end
     h = jnp.where(last, end - at.t, at.dt)
@@ -209,6 +226,8 @@ def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Progress
     aimed = jnp.maximum(ratio, 1e-12) / jnp.where(good, 1, STRICT)
     factor = jnp.where(jnp.isfinite(ratio), 0.9 * aimed ** (-1 / step.order), 0.2)
     wanted = lax.stop_gradient(h * jnp.clip(factor, 0.2, 5.0))
+    if max_dt is not None:
+        wanted = jnp.minimum(wanted, max_dt)
     shortened = good & last  # to stop at a time: no reason for a smaller dt
     take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)  # noqa: E731
     return _Progress(
@@ -220,6 +239,7 @@ def _try_step(step: Any, f: VectorField, args: PyTree, end: Array, at: _Progress
         accepted=at.accepted + good,
         tried=at.tried + 1,
         failed=~good,
+        longest=lax.stop_gradient(jnp.where(good, jnp.maximum(at.longest, h), at.longest)),
     )
 
 

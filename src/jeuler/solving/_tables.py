@@ -26,7 +26,8 @@ def adaptive_table(solution: Any) -> str:
     steps = f"{accepted.sum()} accepted, {rejected.sum()} rejected"
     end = "yes" if finished.all() else f"no: {np.count_nonzero(~finished)} of {finished.size} runs used max_steps"
     rows = [("time", span(solution.t)), ("saved", saved(solution.t)), ("y", summary(solution.y))]
-    return table("AdaptiveSolution", [*rows, ("steps", steps), ("finished", end)])
+    gap = f"{np.max(np.asarray(solution.longest_gap)):.3g} s"
+    return table("AdaptiveSolution", [*rows, ("steps", steps), ("finished", end), ("longest gap", gap)])
 
 
 def span(t: Any) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from typing import Any
 
+import numpy as np
 from numpy.polynomial import Polynomial
 
 from jeuler._core import trees
@@ -33,6 +34,11 @@ class EmbeddedStep:
     weights: tuple[float, ...]
     error_weights: tuple[float, ...]
     allowed: float = 0.1
+
+    @property
+    def gap(self) -> float:
+        """The longest part of a step between two looks at f."""
+        return float(np.max(np.diff(np.unique([0.0, *self.nodes, 1.0]))))
 
     def start(self, f: VectorField, t: Any, y: PyTree, args: Any) -> PyTree:
         """What the first step takes over: the slope."""

@@ -35,6 +35,11 @@ class ExtrapolatedStep:
         return f"extrapolated {getattr(self.base, '__name__', 'step')} of order {self.order}"
 
     @property
+    def gap(self) -> float:
+        """The longest part of a step between two looks at f, of `solve_adaptive`: the last substep of the last row."""
+        return 1 / self.order
+
+    @property
     def explicit(self) -> bool:
         return getattr(self.base, "explicit", False)
 
