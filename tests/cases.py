@@ -104,6 +104,10 @@ FORCES = {
     "gust": lambda: jeuler.QuadraticDrag(0.4, air=jeuler.Gust([3.0, 0.5], period=0.7)),
     "turbulence": lambda: jeuler.LinearDrag(0.4, air=jeuler.turbulence(dim=2, speed=1.0, size=0.8, time=0.5, modes=4)),
     "vortex": lambda: jeuler.LinearDrag(0.4, air=jeuler.Vortex([0.4, 0.3], circulation=3.0, core=0.2)),
+    "dry_friction": lambda: jeuler.DryFriction(0.4, slow=0.2),
+    "applied_force": lambda: jeuler.AppliedForce(
+        jeuler.SampledPath([0.0, 0.5, 1.0], [[0.0, 1.0], [2.0, 0.5], [-1.0, 0.0]]), particles=[1, 3], gain=0.5
+    ),
     "attractor": lambda: jeuler.PointAttractor([0.3, 2.0], 5.0, softening=0.1),
     "viscosity": lambda: jeuler.Viscosity(NET_EDGES, np.linspace(0.1, 0.5, 5)),
     "bending": lambda: jeuler.Bending([[0, 1, 2], [1, 2, 3]], [0.3, 0.5], 0.4),

@@ -94,6 +94,7 @@ RESULTS = {
     "MethodAdvice": lambda: jeuler.advise_method(decay, 1.0, t1=1.0, error=0.1, methods={"Euler": jeuler.euler_step}),
     "RankedMethod": lambda: RESULTS["MethodAdvice"]().best,
     "Diagnosis": lambda: jeuler.Diagnosis(False, step=3, part="forces[0] Springs", springs=(4,), cause="it blew up"),
+    "Comparison": lambda: jeuler.compare_fits(*[RESULTS["Fit"]()] * 2),
     "Recording": lambda: jeuler.Recording(np.linspace(0.0, 1.0, 3), np.zeros((3, 1, 2)), sigma=0.01),
     "Trajectory": trajectory,
     "Setup": jeuler.scenes.fountain,

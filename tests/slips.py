@@ -270,6 +270,8 @@ RIGHT = {
     "Viscosity": (made(jeuler.Viscosity, force), {"edges": ("edges", [[0, 1]]), "coefficient": ("parameter from 0", 0.1)}),
     "Bending": (made(jeuler.Bending, lambda b: run(jeuler.Scene((b,)), SPACE)), {"triples": ("triples", [[0, 1, 2]]), "stiffness": ("parameter from 0", 1.0)}),
     "PointAttractor": (made(jeuler.PointAttractor, force), {"center": ("vector", [0.0, 0.0]), "strength": ("any number", 1.0), "softening": ("positive", 0.1)}),
+    "DryFriction": (made(jeuler.DryFriction, force), {"coefficient": ("parameter from 0", 0.1), "slow": ("positive", 0.1)}),
+    "AppliedForce": (made(jeuler.AppliedForce, force), {"force": ("vector", [1.0, 0.0]), "particles": ("bodies", [0]), "gain": ("any number", 1.0)}),
     "ShapeMatching": (made(jeuler.ShapeMatching, force), {"particles": ("bodies", [0, 1]), "rest_position": ("points of a shape", [[0.0, 0.0], [1.0, 0.0]]), "stiffness": ("not negative", 1.0), "damping": ("not negative", 0.0)}),
     "PenaltyContact": (made(jeuler.PenaltyContact, force), {"collider": ("function", FLOOR), "ks": ("parameter from 0", 1.0), "kd": ("parameter from 0", 0.0)}),
     "Wind": (made(jeuler.Wind, air), {"velocity": ("vector", [1.0, 0.0])}),

@@ -26,7 +26,9 @@ from jeuler.effects import (
     SpeedLimit,
 )
 from jeuler.forces import (
+    AppliedForce,
     Bending,
+    DryFriction,
     Gravity,
     Gust,
     LinearDrag,
@@ -75,6 +77,7 @@ if TYPE_CHECKING:
     )
     from jeuler.diagnosis import Diagnosis, diagnose
     from jeuler.fitting import (
+        Comparison,
         Fit,
         FoundSprings,
         Identifiability,
@@ -82,6 +85,7 @@ if TYPE_CHECKING:
         ShootingFit,
         SpringFit,
         Trajectory,
+        compare_fits,
         find_springs,
         fit,
         fit_springs,
@@ -94,16 +98,19 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AdaptiveSolution",
+    "AppliedForce",
     "Bending",
     "Box",
     "Choice",
     "Collisions",
+    "Comparison",
     "Compensated",
     "Cone",
     "Death",
     "DeathOnContact",
     "DeathOutside",
     "Diagnosis",
+    "DryFriction",
     "Emitter",
     "Fit",
     "FoundSprings",
@@ -151,6 +158,7 @@ __all__ = [
     "advise_method",
     "advise_step",
     "cap_cotangent",
+    "compare_fits",
     "diagnose",
     "empty_pool",
     "euler_step",
@@ -193,6 +201,7 @@ _ON_DEMAND = {  # packages that are imported at the first use of a name of their
     "diagnosis": ("Diagnosis", "diagnose"),
     "observing": (),
     "fitting": (
+        "Comparison",
         "Fit",
         "FoundSprings",
         "Identifiability",
@@ -200,6 +209,7 @@ _ON_DEMAND = {  # packages that are imported at the first use of a name of their
         "ShootingFit",
         "SpringFit",
         "Trajectory",
+        "compare_fits",
         "find_springs",
         "fit",
         "fit_springs",

@@ -66,6 +66,32 @@ def test_recordings_of_different_sensors_lengths_and_rates_share_the_spring(rand
     assert "held out" not in found.message
 
 
+def test_recordings_with_measured_inputs_of_their_own_give_spring_and_gain(random):
+    """A shaker at 2 rad/s for 4 s and at 8 rad/s for 3 s, from rest: x'' = -ks x - kd x' + 2.5 u, by its closed form."""
+    recordings = []
+    for rate, span in ((2.0, 4.0), (8.0, 3.0)):
+        t = np.arange(0.0, span + 1e-9, 0.05)
+        amplitude = 2.5 / (KS - rate**2 + 1j * rate * KD)  # of the steady motion to u = cos(rate t)
+        g = KD / 2
+        w = np.sqrt(KS - g * g)
+        x0, v0 = -amplitude.real, -(1j * rate * amplitude).real
+        x = (
+            np.exp(-g * t) * (x0 * np.cos(w * t) + (v0 + g * x0) / w * np.sin(w * t))
+            + (amplitude * np.exp(1j * rate * t)).real
+        )
+        shaker = jeuler.AppliedForce(jeuler.SampledPath.band_limited(t, np.cos(rate * t)[:, None]), particles=[1])
+        scene = jeuler.Scene((SCENE.forces[0], shaker))
+        recordings.append(jeuler.Recording(t, 1 + x + 1e-4 * random.normal(size=t.shape), scene=scene))
+    state = jeuler.ParticleState([[0.0], [1.0]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
+    options = {"observe": observing.Position([1]), "dt": 0.02, "parameters": ("ks", "kd", "gain of the shaker")}
+    with pytest.raises(ValueError, match="parameters must be among"):
+        jeuler.fit_springs(recordings[0].scene, state, recordings=recordings, **options)
+    options["parameters"] = ("ks", "kd", "forces[1].gain")
+    found = jeuler.fit_springs(recordings[0].scene, state, recordings=recordings, **options)
+    np.testing.assert_allclose([found.ks, found.kd, found.params["forces[1].gain"]], [KS, KD, 2.5], rtol=5e-3)
+    assert found.explained > 0.99999
+
+
 def test_angles_are_compared_up_to_full_turns():
     """A pendulum that goes over the top twice, its angle unwrapped, on a stiff spring."""
     state = jeuler.ParticleState([[0.0, 0.0], [0.0, -1.02]], [[0.0, 0.0], [7.0, 0.0]], mass=[jnp.inf, 1.0])

@@ -1,5 +1,6 @@
 """Fitting: parameters of a simulation from what was measured, by gradient."""
 
+from jeuler.fitting._comparison import Comparison, compare_fits
 from jeuler.fitting._find_springs import FoundSprings, find_springs
 from jeuler.fitting._fit import fit
 from jeuler.fitting._identifiability import Identifiability, identifiability
@@ -10,6 +11,7 @@ from jeuler.fitting.result import Fit
 from jeuler.fitting.trajectory import Trajectory, read_trajectory
 
 __all__ = [
+    "Comparison",
     "Fit",
     "FoundSprings",
     "Identifiability",
@@ -17,6 +19,7 @@ __all__ = [
     "ShootingFit",
     "SpringFit",
     "Trajectory",
+    "compare_fits",
     "find_springs",
     "fit",
     "fit_springs",

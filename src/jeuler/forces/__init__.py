@@ -1,16 +1,20 @@
 """Forces: ``force(t, position, velocity, mass) -> (particle, dim)`` in N. A file for each kind."""
 
 from jeuler.forces.air import Gust, Turbulence, Vortex, Wind, turbulence
+from jeuler.forces.applied import AppliedForce
 from jeuler.forces.attraction import PointAttractor
 from jeuler.forces.drag import LinearDrag, QuadraticDrag
 from jeuler.forces.fields import Gravity
+from jeuler.forces.friction import DryFriction
 from jeuler.forces.hair import StrandBending, StrandCore, strand_edges
 from jeuler.forces.neighbours import Bending, Viscosity
 from jeuler.forces.soft_body import ShapeMatching
 from jeuler.forces.springs import Springs
 
 __all__ = [
+    "AppliedForce",
     "Bending",
+    "DryFriction",
     "Gravity",
     "Gust",
     "LinearDrag",
