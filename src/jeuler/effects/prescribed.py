@@ -72,7 +72,7 @@ class SampledPath:
           >>> t = np.arange(100) * 0.1
           >>> path = jeuler.SampledPath.band_limited(t, np.sin(2 * np.pi * 2.5 * t))  # four samples a period
           >>> round(float(path(5.05)), 3), round(float(np.sin(2 * np.pi * 2.5 * 5.05)), 3)
-          (0.707, 0.707)
+          (-0.707, -0.707)
 
         Source: J. F. Kaiser, Nonrecursive digital filter design using the I0-sinh window function, 1974.
         """
