@@ -128,7 +128,10 @@ def one(tool, count, path):
     if tool == "jeuler":
         import jax
 
+        import jeuler
+
         jax.config.update("jax_enable_x64", True)
+        jeuler.fit_springs  # noqa: B018  # loads what fits
     else:
         from mujoco import sysid  # noqa: F401
     for module in ("scipy.interpolate", "scipy.optimize", "scipy.sparse.linalg", "scipy.stats", "tqdm"):

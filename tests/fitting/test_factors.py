@@ -42,3 +42,12 @@ def test_a_column_that_is_not_finite_spoils_no_other(rows):
     within, triangle = factors.projected(a, columns)
     assert np.isnan(within[:, 1]).all()
     np.testing.assert_allclose(triangle.T @ within[:, 0], a.T @ columns[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("m", "n"), [(1203, 10), (2000, 1), (8020, 44), (3, 5), (0, 3), (5, 0), (700, 100)])
+def test_reflections_by_blocks_are_a_factorisation(m, n):
+    a = np.random.default_rng(0).normal(size=(m, n))
+    q, triangle = factors.tall_qr(a)
+    np.testing.assert_allclose(q @ triangle, a, atol=1e-13)
+    np.testing.assert_allclose(q.T @ q, np.eye(min(m, n)), atol=1e-13)
+    np.testing.assert_array_equal(np.tril(triangle, -1), 0)

@@ -32,7 +32,8 @@ def recorded(times, step, dtype, effects=(), names=("ks", "kd", "velocity"), dt=
     [(jeuler.rk4_step, float), (jeuler.rk4_step, np.float32), (jeuler.symplectic_euler_step, float)],
 )
 def test_residual_and_jacobian_are_those_of_the_differentiated_run(times, step, dtype):
-    task = recorded(times, step, dtype)
+    others = ("ks", "rest_length", "mass", "position", "anchors")
+    task = recorded(times, step, dtype, names=("ks", "kd", "velocity") if times is ON_THE_GRID else others)
     problem = task.problem(task.start, None, None, None, ())
     x = np.asarray(problem.x, float)
     assert len(x) > 8

@@ -83,7 +83,7 @@ def as_float(x: ArrayLike | None) -> Array | None:
     if x is None or (isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)):
         return x
     if isinstance(x, (int, float)) and not isinstance(x, bool):
-        return jnp.asarray(float(x))
+        return jax.device_put(float(x))  # asarray would compile a program
     if any(isinstance(part, jax.Array) for part in jax.tree.leaves(x)):  # a list with traced numbers: not for NumPy
         x = jnp.asarray(x)
     kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
