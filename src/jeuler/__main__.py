@@ -30,7 +30,8 @@ EPILOG = """examples:
   python -m jeuler look swing.csv                       what is understood of a file, and the command to fit it
   python -m jeuler fit swing.csv --mass 0.25            one particle on a spring to a fixed point
   python -m jeuler fit drop.csv --from 0.75 --drag quadratic
-  python -m jeuler fit two.csv --mass 0.2,0.3 --edges 1-anchor,1-2"""
+  python -m jeuler fit two.csv --mass 0.2,0.3 --edges 1-anchor,1-2
+  python -m jeuler find tracks.csv --mass 0.05          which particles are joined, and by what springs"""
 
 
 OBSERVED = ("position", "angle", "acceleration", "velocity", "angular velocity")
@@ -49,7 +50,7 @@ class Parser(argparse.ArgumentParser):
 
 def parser() -> Parser:
     top = Parser(prog="jeuler", description="Springs, particles and ODEs in JAX.")
-    jobs = top.add_subparsers(dest="job", required=True, metavar="{fit,look}", parser_class=Parser)
+    jobs = top.add_subparsers(dest="job", required=True, metavar="{fit,look,find}", parser_class=Parser)
     fit = jobs.add_parser(
         "fit",
         help="recover stiffness ks and damping kd of a measured oscillation",
@@ -75,16 +76,30 @@ def parser() -> Parser:
     )
     look.add_argument("file", metavar="FILE", help="a recording as it was exported")
     _add_reading(look)
+    find = jobs.add_parser(
+        "find",
+        help="find which tracked particles are joined by springs, and ks, kd and rest length of each",
+        description="Find which tracked particles are joined by springs, and ks, kd and rest length of each.",
+    )
+    find.add_argument("file", metavar="FILE", help="tracks as they were exported, such as x1,y1,x2,y2, ... over time")
+    _add_reading(find, tracks=True)
+    add = find.add_argument
+    add("--mass", help="mass of the particles in kg, one number or one each: 0.2,0.3; inf for a pinned one (default 1)")
+    add("--gravity", metavar="X,Y", help="the acceleration that acts on all, m/s^2: 0,-9.81 (default: none)")
+    add("--sigma", type=float, help="the noise of the positions in m (default: estimated)")
+    add("--plot", metavar="OUT.png", help="where the picture goes (default jeuler_find.png); - is standard output")
+    add("--json", metavar="OUT.json", help="write the result as JSON too; - is standard output")
     return top
 
 
-def _add_reading(job: argparse.ArgumentParser) -> None:
+def _add_reading(job: argparse.ArgumentParser, tracks: bool = False) -> None:
     """Options that correct how a recording is understood."""
     add = job.add_argument
     add("--columns", help="columns to use, by name: x1,y1,x2,y2 (default: by quantity, said in the result)")
-    add("--observe", choices=OBSERVED, help="the quantity to use (default: position before angle before acceleration)")
-    add("--input", metavar="NAME", help="the column of a measured force; its gain is fitted")
-    add("--support", metavar="NAME", help="the column of the measured position of what the spring hangs on")
+    if tracks:
+        job.set_defaults(observe=None, input=None, support=None)
+    else:
+        _add_quantities(job)
     add("--dim", type=int, help="coordinates a particle, where the names do not tell")
     add("--time", metavar="NAME", help="the time column (default: the one that is named so)")
     add("--run", metavar="N", help="which run, or all in one fit (default: the one with the most rows)")
@@ -92,6 +107,14 @@ def _add_reading(job: argparse.ArgumentParser) -> None:
     add("--skip", type=int, metavar="N", help="leave out the first lines of the file")
     add("--from", dest="begin", type=float, metavar="T", help="leave out what was measured before this time, s")
     add("--to", dest="end", type=float, metavar="T", help="leave out what was measured after this time, s")
+
+
+def _add_quantities(job: argparse.ArgumentParser) -> None:
+    """Options that say what was measured."""
+    add = job.add_argument
+    add("--observe", choices=OBSERVED, help="the quantity to use (default: position before angle before acceleration)")
+    add("--input", metavar="NAME", help="the column of a measured force; its gain is fitted")
+    add("--support", metavar="NAME", help="the column of the measured position of what the spring hangs on")
 
 
 def _add_model(job: argparse.ArgumentParser) -> None:
@@ -128,12 +151,15 @@ def main(argv: list[str] | None = None) -> int:
         from jeuler.commands.program_cache import keep_programs
 
         keep_programs()
+    from jeuler.commands.find_file import find_file
     from jeuler.commands.fit_file import fit_file
     from jeuler.commands.look_file import look_file
 
     try:
         if arguments.job == "look":
             look_file(arguments)
+        elif arguments.job == "find":
+            find_file(arguments)
         else:
             fit_file(arguments, STARTED if argv is None else time.perf_counter())
     except (ValueError, OSError) as error:

@@ -71,17 +71,22 @@ def choose_columns(recording: Recording, arguments: Any) -> tuple[list[Column], 
             if c.index not in taken and c != drive
         ]
     quantity = quantity if quantity in OBSERVED else "position"
-    if arguments.columns is None and len(columns) > MOST_CHANNELS:
+    if arguments.columns is None and len(columns) > MOST_CHANNELS and not _takes_all(arguments):
         raise ValueError(
             f"{recording.source}: {len(columns)} columns are of {quantity}, at most {MOST_CHANNELS} are fitted "
             f"without --columns: {listed([c.name for c in columns])}; choose with it"
         )
-    if arguments.columns is None and arguments.dim is None:
+    if arguments.columns is None and arguments.dim is None and not _takes_all(arguments):
         columns, still = _without_still(recording, columns)
         columns, more = _one_channel(recording, columns)
         others += still + more
     columns, dim = _particles(recording.source, columns, arguments)
     return columns, quantity, dim, others
+
+
+def _takes_all(arguments: Any) -> bool:
+    """Whether every track counts, as for ``find``: what rests may be what others hang on."""
+    return getattr(arguments, "job", "") == "find"
 
 
 def _quantity(recording: Recording, usable: list[Column], observe: str | None) -> str:

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from jeuler._core.files import check_output, write_text
+from jeuler._core.files import write_text
 from jeuler.commands import options
 from jeuler.commands.cautions import cautions
 from jeuler.commands.estimate import Estimate, estimate, guess_of, step_size
 from jeuler.commands.linear_start import band_limited, without_drift
 from jeuler.commands.model import Model
+from jeuler.commands.outputs import STANDARD_OUTPUT, check_kind, check_outputs
 from jeuler.commands.page import page
 from jeuler.commands.picture import draw
 from jeuler.commands.report import compared, lines, report
@@ -26,8 +27,6 @@ from jeuler.commands.selection import Measurement, recordings_in, select, togeth
 from jeuler.fitting.oscillation import Oscillation
 
 DEFAULT_PICTURE = "jeuler_fit.png"
-PICTURES = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".eps", ".ps")
-STANDARD_OUTPUT = "-"
 MOST_DRIFT = 6
 NEED_A_FILE = ("columns", "observe", "input", "support", "dim", "time", "run", "unit", "skip", "begin", "end")
 
@@ -35,8 +34,8 @@ NEED_A_FILE = ("columns", "observe", "input", "support", "dim", "time", "run", "
 def fit_file(arguments: argparse.Namespace, started: float) -> None:
     """Read, fit, print, draw."""
     picture = DEFAULT_PICTURE if arguments.plot is None else arguments.plot
-    _check_outputs(arguments.files, {"--plot": picture, "--json": arguments.json, "--report": arguments.report})
-    _check_kind(picture)
+    check_outputs(arguments.files, {"--plot": picture, "--json": arguments.json, "--report": arguments.report})
+    check_kind(picture)
     for option in ("begin", "end"):
         options.check_number({"begin": "--from", "end": "--to"}[option], getattr(arguments, option))
     options.check_number("--dt", arguments.dt, positive=True)
@@ -173,39 +172,6 @@ def _fit(
         for kind, found, score in zip(kinds, tried, scores, strict=True)
     ]
     return tried[best], compared
-
-
-def _check_outputs(files: list[str], asked: dict[str, str | None]) -> None:
-    """Refuse, before the fit, outputs that cannot be written or that would overwrite the recording."""
-    outputs = {option: path for option, path in asked.items() if path is not None and path != STANDARD_OUTPUT}
-    for option, path in outputs.items():
-        try:
-            check_output(path)
-        except ValueError as error:
-            raise ValueError(f"{option} {error}") from None
-        for file in files:
-            if os.path.exists(file) and os.path.realpath(file) == os.path.realpath(path):
-                raise ValueError(f"{option} {path}: is the measured file itself; give another name")
-    if list(asked.values()).count(STANDARD_OUTPUT) > 1:
-        raise ValueError(f"one output at most can be {STANDARD_OUTPUT}, standard output; give the others a name")
-    plain = [(option, path) for option, path in outputs.items() if not _is_stream(path)]
-    for k, (option, path) in enumerate(plain):
-        for other, earlier in plain[:k]:
-            if os.path.realpath(path) == os.path.realpath(earlier):
-                raise ValueError(f"{other} and {option} must be different files, got {path} for both")
-
-
-def _check_kind(picture: str) -> None:
-    """One ValueError if a picture has no ending that says its kind."""
-    ending = os.path.splitext(os.path.realpath(picture))[1].lower()
-    if picture != STANDARD_OUTPUT and not _is_stream(picture) and ending not in PICTURES:
-        raise ValueError(
-            f"--plot {picture}: a picture's name must end in {', '.join(PICTURES[:4])}, got {ending or 'none'!r}"
-        )
-
-
-def _is_stream(path: str) -> bool:
-    return os.path.exists(path) and not os.path.isfile(path)
 
 
 def _write_outputs(

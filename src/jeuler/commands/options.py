@@ -56,6 +56,29 @@ def masses(text: str | None, particles: int) -> np.ndarray:
     return np.broadcast_to([next(filled) if part != "?" else math.nan for part in parts], (particles,)).copy()
 
 
+def known_masses(text: str | None, particles: int) -> np.ndarray:
+    """Mass of each particle, kg; inf for one that is pinned."""
+    if text is None:
+        return np.ones(particles)
+    values = _floats("--mass", text)
+    if len(values) not in (1, particles) or not all(1e-12 < value < 1e12 or value == math.inf for value in values):
+        raise ValueError(
+            f"--mass must be one positive number of kg or {particles}, one a particle (inf for one that is pinned), "
+            f"got {text!r}"
+        )
+    return np.broadcast_to(values, (particles,)).copy()
+
+
+def vector(option: str, text: str | None, dim: int) -> np.ndarray | None:
+    """One number a coordinate; None where the option is not given."""
+    if text is None:
+        return None
+    values = _floats(option, text)
+    if len(values) != dim or not np.isfinite(values).all():
+        raise ValueError(f"{option} must be {dim} finite numbers, one a coordinate, got {text!r}")
+    return np.array(values)
+
+
 def edges(text: str | None, particles: int) -> tuple[list[tuple[int, int]], list[int]]:
     """Pairs of particles joined by springs, and particles joined to an anchor each; indices from 0."""
     pairs: list[tuple[int, int]] = []
