@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.interpreters import ad, batching, mlir
 
 from jeuler._jax.jaxpr import Primitive
+from jeuler._jax.placed import typed
 
 anywhere_p = Primitive("anywhere")
 
@@ -34,7 +35,7 @@ def where_needed(needed: Array, work: Callable[..., Any], otherwise: Any, *opera
 
 
 anywhere_p.def_impl(jax.jit(jnp.any))
-anywhere_p.def_abstract_eval(lambda what: jax.core.ShapedArray((), bool))
+anywhere_p.def_abstract_eval(typed(jnp.any, lambda what: jax.core.ShapedArray((), bool)))
 mlir.register_lowering(anywhere_p, mlir.lower_fun(jnp.any, multiple_results=False))
 ad.primitive_jvps[anywhere_p] = lambda primals, _: (
     anywhere_p.bind(*primals),

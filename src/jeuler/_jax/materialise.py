@@ -14,6 +14,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jeuler._jax import batch_last
 from jeuler._jax.jaxpr import Primitive
+from jeuler._jax.placed import typed
 from jeuler._jax.platforms import CPU
 
 stored_p = Primitive("stored")
@@ -53,7 +54,7 @@ def as_stored(x: Array) -> Array:
 
 
 stored_p.def_impl(lambda x: x)
-stored_p.def_abstract_eval(lambda x: jax.core.ShapedArray(x.shape, x.dtype))
+stored_p.def_abstract_eval(typed(as_stored, lambda x: jax.core.ShapedArray(x.shape, x.dtype)))
 mlir.register_lowering(stored_p, mlir.lower_fun(lambda x: x, multiple_results=False))
 mlir.register_lowering(stored_p, mlir.lower_fun(as_stored, multiple_results=False), platform=CPU)
 ad.deflinear2(stored_p, lambda cotangent, x: [stored(cotangent)])

@@ -23,6 +23,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jeuler._jax import platforms
 from jeuler._jax.batch_last import batch_last, fits, mostly_numbers, reached
 from jeuler._jax.jaxpr import Jaxpr, Primitive, evaluate
+from jeuler._jax.placed import is_placed
 
 MANY = 64  # members from which on the batch axis goes last,
 SHORT = 48  # if no operand of one member has a longer last axis: longer loops are as fast as they are
@@ -43,7 +44,8 @@ def recomputed(function: Callable) -> Callable:
     def call(f, *arguments):
         of_arguments = functools.partial(function, f)
         closed, form = jax.make_jaxpr(of_arguments, return_shape=True)(*arguments)
-        if closed.effects:  # it prints, or talks to other members by the name of an axis
+        # it prints, or talks to other members by the name of an axis; or types name a mesh, to which a batch belongs
+        if closed.effects or any(map(is_placed, [*closed.consts, *closed.in_avals, *closed.out_avals])):
             return jax.checkpoint(of_arguments, prevent_cse=False)(*arguments)
         operands = [*closed.consts, *jax.tree.leaves(arguments)]
         count = len(closed.consts)

@@ -24,7 +24,9 @@ from jax._src import core  # which trace is at work: no public name says it with
 
 from jeuler._core.component import Function, Partitioned
 from jeuler._core.precision import setting
+from jeuler._jax.apart import apart
 from jeuler._jax.captured import CYCLE, Opaque, WithArrays, token, trusted
+from jeuler._jax.placed import is_placed, may_be_placed
 
 MOST = 128  # programs kept; the one not used for the longest goes first
 NUMBERS = frozenset([float, int, bool, complex])
@@ -71,7 +73,7 @@ def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
       settings: hashable values that are part of the program.
     """
     if setting("jax_disable_jit") or _under_jit():
-        return function(*inputs, *settings)
+        return _on_a_mesh(function, inputs, settings)
     return prepared(function, inputs, settings)()
 
 
@@ -137,12 +139,10 @@ class Program:
         self.notes: dict[Any, Any] = {}  # what its callers keep with it
 
         def run(dynamic, arrays, first, rest):
-            given, made = iter(dynamic), WithArrays(arrays)
-            pairs = zip(current.leaves, tokens, strict=True)
-            leaves = [next(given) if name is None else made.of(leaf) for leaf, name in pairs]
+            leaves = _put_together(current.leaves, tokens, dynamic, arrays)
             return function(*jax.tree.unflatten(structure, leaves), *settings, *first, *rest)
 
-        self.compiled = jax.jit(run, donate_argnums=2)
+        self.compiled = jax.jit(apart(run), donate_argnums=2)
 
     def __call__(self, leaves: list, dynamic: list | None, arrays: list | None, further: tuple) -> Any:
         before, current.leaves = getattr(current, "leaves", None), leaves
@@ -150,6 +150,29 @@ class Program:
             return self.compiled(dynamic, arrays, further[:1], further[1:])
         finally:
             current.leaves = before
+
+
+def _on_a_mesh(function: Callable, inputs: tuple, settings: tuple) -> Any:
+    """function(*inputs, *settings) while a program is traced, where arrays may be on a mesh of explicit axes."""
+    leaves, structure = jax.tree.flatten(inputs, is_leaf=functools.partial(_stands_alone, set()))
+    placed = any(is_placed(leaf) for leaf in leaves if isinstance(leaf, jax.Array))
+    try:
+        dynamic, arrays, tokens = _tokens(leaves) if placed or may_be_placed() else ((), (), None)
+    except (Opaque, TypeError):  # what its functions read cannot be told
+        tokens = None
+    if tokens is None:
+        return function(*inputs, *settings)
+
+    def run(dynamic, arrays):
+        return function(*jax.tree.unflatten(structure, _put_together(leaves, tokens, dynamic, arrays)), *settings)
+
+    return apart(run)(dynamic, arrays)
+
+
+def _put_together(leaves: list, tokens: tuple, dynamic: Any, arrays: Any) -> list:
+    """The leaves of a call, with these inputs and these arrays within functions."""
+    given, made = iter(dynamic), WithArrays(arrays)
+    return [next(given) if name is None else made.of(leaf) for leaf, name in zip(leaves, tokens, strict=True)]
 
 
 def _traced_again(function: Callable, settings: tuple, leaves: list, structure: Any, further: tuple) -> Callable:

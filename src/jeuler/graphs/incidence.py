@@ -20,6 +20,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jeuler._jax import batch_last
 from jeuler._jax.jaxpr import Primitive
+from jeuler._jax.placed import typed
 
 difference_p: Any = Primitive("difference")
 accumulate_p: Any = Primitive("accumulate")
@@ -71,7 +72,7 @@ def _linear(primitive: Any, transpose: Any) -> None:
 def _register(primitive: Any, transpose: Any, rule: Any, shape: Any) -> None:
     """Teach JAX the primitive: its values, its shape, its compiled form, its derivatives and batches."""
     primitive.def_impl(jax.jit(rule, static_argnames="layout"))
-    primitive.def_abstract_eval(shape)
+    primitive.def_abstract_eval(typed(rule, shape))
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=False))
     _linear(primitive, transpose)
     batch_last.written_out[primitive] = rule

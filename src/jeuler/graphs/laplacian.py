@@ -37,6 +37,7 @@ from jeuler._core.vectors import total
 from jeuler._jax import batch_last
 from jeuler._jax.jaxpr import Primitive
 from jeuler._jax.materialise import padded, stored
+from jeuler._jax.placed import typed
 
 products_p: Any = Primitive("products")
 products_p.multiple_results = True
@@ -118,20 +119,25 @@ def _batched(primitive):
     return rule
 
 
-def _register(primitive: Any, rule: Any) -> None:
-    """Teach JAX the values, the compiled form and the batches of the primitive; its derivatives follow below."""
+def _products_types(x, y, *, offsets):
+    return [jax.core.ShapedArray((*x.shape[:-1], x.shape[-1] + k), x.dtype) for k in offsets]
+
+
+def _laplacian_type(*operands, offsets):
+    return jax.core.ShapedArray(operands[-1].shape, operands[-1].dtype)
+
+
+def _register(primitive: Any, rule: Any, types: Any) -> None:
+    """Teach JAX the values, types, compiled form and batches of the primitive; its derivatives follow below."""
     primitive.def_impl(jax.jit(rule, static_argnames="offsets"))
+    primitive.def_abstract_eval(typed(rule, types))
     mlir.register_lowering(primitive, mlir.lower_fun(rule, multiple_results=primitive.multiple_results))
     batching.primitive_batchers[primitive] = _batched(primitive)
     batch_last.written_out[primitive] = rule
 
 
-_register(products_p, _products)
-_register(laplacian_p, _laplacian)
-products_p.def_abstract_eval(
-    lambda x, y, *, offsets: [jax.core.ShapedArray((*x.shape[:-1], x.shape[-1] + k), x.dtype) for k in offsets]
-)
-laplacian_p.def_abstract_eval(lambda *operands, offsets: jax.core.ShapedArray(operands[-1].shape, operands[-1].dtype))
+_register(products_p, _products, _products_types)
+_register(laplacian_p, _laplacian, _laplacian_type)
 ad.primitive_jvps[products_p] = _products_jvp
 ad.primitive_jvps[laplacian_p] = _laplacian_jvp
 ad.primitive_transposes[products_p] = _products_transpose

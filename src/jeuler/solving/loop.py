@@ -13,6 +13,7 @@ from jax import Array, lax
 
 from jeuler._core import checks, trees
 from jeuler._core.precision import setting
+from jeuler._jax.placed import as_carried
 from jeuler.solving.grid import COUNTER, Grid
 
 PyTree = Any
@@ -83,7 +84,7 @@ def in_one_scan(loop: Loop) -> tuple[Array, PyTree, Array, Any]:
         carry = loop.within(lambda carry: _scan(loop.one_step, carry, grid.save_every, grid.segment)[0], carry)
         return carry, loop.saved(carry)
 
-    carry = loop.first_carry()
+    carry = as_carried(lambda carry: loop.one_step(carry)[0], loop.first_carry())
     blocks = None if grid.segment is None else max(1, grid.segment // grid.save_every)
     last, rest = _scan(one_save, carry, grid.num_steps // grid.save_every, blocks)
     t, y = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), loop.saved(carry), rest)
