@@ -94,6 +94,9 @@ STRAND_REST = np.array([[[0.0, 0.0, 0.0], [0.3, 0.1, -0.2], [0.2, 0.4, -0.4], [0
 FLOOR = jeuler.Plane([0.0, 0.4], [0.1, 1.0])
 
 FORCES = {
+    "cubic_springs": lambda: jeuler.CubicSprings(NET_EDGES, np.linspace(20.0, 60.0, 5), 0.7, 0.9, cubic=30.0),
+    "strings": lambda: jeuler.Strings(NET_EDGES, ks=30.0, kd=0.7, rest_length=np.linspace(0.9, 1.3, 5)),
+    "torsion": lambda: jeuler.Torsion(STRAND, 0.4, 2.0),
     "gravity": lambda: jeuler.Gravity([0.3, -9.81]),
     "springs": lambda: jeuler.Springs(NET_EDGES, ks=np.linspace(20.0, 60.0, 5), kd=0.7, rest_length=0.9),
     "springs_without_length": lambda: jeuler.Springs(NET_EDGES, ks=30.0, kd=np.linspace(0.1, 1.0, 5), rest_length=0.0),
@@ -117,12 +120,20 @@ FORCES = {
     "strand_core": lambda: jeuler.StrandCore(STRAND, STRAND_REST, 3.0, 0.5, 1.0),
     "function": lambda: lambda t, position, velocity, mass: -0.1 * velocity + 0.2 * jnp.sin(t),
 }
-IN_SPACE = ("strand_bending", "strand_core")
+IN_SPACE = ("strand_bending", "strand_core", "torsion")
 # action equals reaction; and those whose forces have no torque either
 INTERNAL_FORCES = (
-    "springs", "springs_without_length", "no_springs", "viscosity", "bending", "shape_matching", *IN_SPACE,
+    "springs", "springs_without_length", "no_springs", "cubic_springs", "strings", "viscosity", "bending", "shape_matching", *IN_SPACE,
 )  # fmt: skip
-CENTRAL_FORCES = ("springs", "springs_without_length", "no_springs", "bending", "shape_matching")
+CENTRAL_FORCES = (
+    "springs",
+    "cubic_springs",
+    "strings",
+    "springs_without_length",
+    "no_springs",
+    "bending",
+    "shape_matching",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,6 +166,8 @@ EFFECTS = {
     ),
     "collisions": effect(lambda: jeuler.Collisions(SOLIDS, radius=0.05, restitution=0.5, friction=0.3), "unresolved_contacts"),
     "colliding_pairs": effect(lambda: jeuler.Collisions(pairs=[(1, 2)], radius=0.2, restitution=0.5), "unresolved_contacts"),
+    "distance_links": effect(lambda: jeuler.DistanceLinks([(0, 1), (1, 2)], length=[1.0, 0.8]), "unresolved_links"),
+    "breaking": effect(lambda: jeuler.Breaking(jeuler.BreakableSprings(NET_EDGES, 30.0, 0.7, 0.9), 0.4), "broken", "broken_springs"),
     "speed_limit": effect(lambda: jeuler.SpeedLimit(0.5)),
     "emitter": effect(lambda: jeuler.Emitter(40.0, PLACE, SPEED, max_births=2), *POOL),
     "emitter_of_a_disc": effect(

@@ -76,6 +76,7 @@ FORCES = {name: make for name, make in cases.FORCES.items() if name != "function
 RESULTS = {
     "ParticleState": lambda: hanging()[1].replace(temperature=jnp.array([1.0, 2.0])),
     "Scene": lambda: jeuler.Scene((hanging()[0].forces[0], drift), (jeuler.SpeedLimit(3.0),)),
+    "BreakableSprings": lambda: jeuler.BreakableSprings([[0, 1]], ks=10.0, kd=0.1, rest_length=1.0),
     "Death": lambda: jeuler.Death(to_the_right),
     "Solution": solution,
     "AdaptiveSolution": lambda: jeuler.solve_adaptive(decay, 1.0, t1=1.0, rtol=1e-3, max_steps=16),
@@ -108,6 +109,7 @@ STEPS = {
     "heun_step": lambda: jeuler.heun_step,
     "rk4_step": lambda: jeuler.rk4_step,
     "implicit_euler_step": lambda: jeuler.implicit_euler_step,
+    "implicit_midpoint_step": lambda: jeuler.implicit_midpoint_step,
     "linearly_implicit_euler_step": lambda: jeuler.linearly_implicit_euler_step,
     "implicit_euler": lambda: jeuler.implicit_euler(max_steps=7),
     "linearly_implicit_euler": lambda: jeuler.linearly_implicit_euler(),

@@ -326,3 +326,24 @@ def test_bad_arguments_get_one_clear_error():
         simulate(Scene(), empty_pool(3, 2).replace(color=jnp.zeros(3)), dt=0.1, num_steps=1)
     with pytest.raises(AttributeError, match="no field 'temprature'; it has position, velocity, mass, alive"):
         empty_pool(3, 2).temprature  # noqa: B018
+
+
+def test_an_emitter_with_a_rate_of_time_on_a_moving_path():
+    """As many births as the integral of the rate; each newborn where the path was, with its share of the speed."""
+
+    def rate(t):
+        return 100 * (1 + jnp.sin(3 * t))
+
+    jet = Emitter(rate, [0.0, 1.0], [0.0, 0.5], path=lambda t: jnp.stack([2 * t, 0 * t]), inherit=0.5, max_births=8)
+    run = simulate(Scene(effects=(jet,)), empty_pool(300, 2), dt=0.01, num_steps=200, save_every=50, key=KEY).y
+    due = 100 * (run.steps * 0.01 + (1 - np.cos(3 * run.steps * 0.01)) / 3)
+    np.testing.assert_allclose(run.births, due, atol=3)
+    born = int(run.births[-1])
+    assert run.missed_births[-1] == 0
+    np.testing.assert_allclose(run.velocity[-1, :born], np.broadcast_to([1.0, 0.5], (born, 2)), atol=1e-12)
+    age = (run.position[-1, :born, 1] - 1) / 0.5
+    np.testing.assert_allclose(run.position[-1, :born, 0], 2 * (2 - age) + age, atol=1e-9)
+    for wrong, match in (({"rate": lambda t: jnp.ones(2)}, "rate"), ({"path": lambda t: t}, "path")):
+        made = dataclasses.replace(jet, **wrong)
+        with pytest.raises(ValueError, match=f"Emitter.{match}"):
+            simulate(Scene(effects=(made,)), empty_pool(3, 2), dt=0.01, num_steps=1, key=KEY)

@@ -2,13 +2,17 @@
 
 from jeuler.effects.appearance import OverLife, SpeedLimit
 from jeuler.effects.births import Emitter
+from jeuler.effects.breaking import Breaking
 from jeuler.effects.deaths import Death, DeathOnContact, DeathOutside, Lifetime
+from jeuler.effects.distance import DistanceLinks
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
 
 __all__ = [
+    "Breaking",
     "Death",
     "DeathOnContact",
     "DeathOutside",
+    "DistanceLinks",
     "Emitter",
     "Lifetime",
     "OverLife",

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core import checks, trees
-from jeuler._core.annotations import Parameter, SampledParameter, default
+from jeuler._core.annotations import MovingParameter, Parameter, SampledParameter, default
 from jeuler._core.calls import previous_is_optional
-from jeuler._core.component import component, store_as_float
+from jeuler._core.component import as_component, component, store_as_float
 from jeuler._core.components import by_component
+from jeuler._core.in_time import at_time, moving
 from jeuler._core.limits import Limits, check_limits
 from jeuler.particles.fields import BEFORE
 from jeuler.particles.state import COUNTERS, DEFAULTS
@@ -35,12 +36,16 @@ class Emitter:
     its sampler; the number of births, the slot and the moment carry none, so the derivative by ``rate`` is 0.
 
     Args:
-      rate: births a second, (), 1/s, >= 0.
+      rate: births a second, (), 1/s, >= 0, or a function of time ``rate(t)``: its births follow each other as evenly as
+        they can, so that a part of a run has as many as its integral says to within 2 or 3.
       position: where, a sampler ``(key, count) -> (count, dim)`` such as `FromSphere`, or one point (dim,), m.
       velocity: how fast, a sampler such as `Cone` or `Normal`, or one vector (dim,), m/s.
       lifetime, mass, color, opacity, size, shape: what newborns get, a sampler or one value; None leaves the field
         out of the state, or at its default where another part of the scene has it.
       extra: samplers of further fields, by name.
+      path: None, or a function of time ``path(t) -> (dim,)``, m, by which the places of birth move; a newborn is where
+        the path was at its moment of birth.
+      inherit: the share of the path's velocity that newborns have beside their own, ().
       bursts: pairs (time in s, number of births). Static.
       start, stop: the stream runs from start to stop, s.
       max_births: the most births in one step, an integer; fewer draws cost less. None allows the whole pool. Static.
@@ -59,7 +64,7 @@ class Emitter:
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983, sect. 2.1-2.2.
     """
 
-    rate: Parameter
+    rate: MovingParameter
     position: SampledParameter
     velocity: SampledParameter
     lifetime: SampledParameter = default(None)
@@ -72,17 +77,26 @@ class Emitter:
     bursts: tuple[tuple[float, int], ...] = ()
     start: Parameter = default(0.0)
     stop: Parameter = default(jnp.inf)
+    path: MovingParameter = default(None)
+    inherit: Parameter = default(0.0)
     max_births: int | None = None
 
     acts = BEFORE
     needs: ClassVar[tuple[str, ...]] = ("key", "clock", "forward time")
-    limits: ClassVar[Limits] = {"rate": (">= 0", "1/s"), "start": ("", "s"), "stop": ("", "s")}
+    limits: ClassVar[Limits] = {"rate": (">= 0", "1/s"), "start": ("", "s"), "stop": ("", "s"), "inherit": ("", "")}
     may_be_infinite: ClassVar[tuple[str, ...]] = ("start", "stop")
 
     def __post_init__(self) -> None:
-        checks.number("Emitter.rate", self.rate)
-        if not checks.is_traced(self.rate) and float(self.rate) < 0:
-            raise ValueError(f"Emitter.rate must be at least 0 births a second, got {self.rate!r}")
+        if callable(self.rate):
+            object.__setattr__(self, "rate", moving("Emitter.rate", self.rate))
+        else:
+            checks.number("Emitter.rate", self.rate)
+            if not checks.is_traced(self.rate) and float(self.rate) < 0:
+                raise ValueError(f"Emitter.rate must be at least 0 births a second, got {self.rate!r}")
+            store_as_float(self, "rate")
+        if self.path is not None:
+            checks.function("Emitter.path", self.path, "(t) -> (dim,)", "write lambda t: jnp.stack([...])")
+            object.__setattr__(self, "path", as_component(self.path))
         if self.max_births is not None:
             checks.count("Emitter.max_births", self.max_births, least=1)
         try:
@@ -93,7 +107,7 @@ class Emitter:
                 f"write bursts=((0.5, 100),)"
             ) from None
         object.__setattr__(self, "bursts", bursts)
-        store_as_float(self, "rate", "start", "stop")
+        store_as_float(self, "start", "stop", "inherit")
         for name in ("position", "velocity", *_OPTIONAL):
             value = getattr(self, name)
             if value is None and name in ("position", "velocity"):
@@ -134,10 +148,15 @@ class Emitter:
         ``steps``: its number with the run that this one goes on from.
         """
         n, t0 = (step_number(t, dt), 0.0) if clock is None else clock
-        per_step = lax.stop_gradient(self.rate * dt)
+        number = (n if steps is None else steps).astype(jnp.int32)
+        if callable(self.rate):
+            per_step = jnp.maximum(lax.stop_gradient(at_time(self.rate, t + dt / 2) * dt), 0)
+            births = births_by_turns(number, per_step)
+        else:
+            births = births_of_stream(number, lax.stop_gradient(self.rate * dt))
         streaming = (t + dt / 2 >= self.start) & (t + dt / 2 < self.stop)
-        stream = jnp.where(streaming, births_of_stream((n if steps is None else steps).astype(jnp.int32), per_step), 0)
-        burst = sum(jnp.where(step_number(time - t0, dt) == n, number, 0) for time, number in self.bursts)
+        stream = jnp.where(streaming, births, 0)
+        burst = sum(jnp.where(step_number(time - t0, dt) == n, many, 0) for time, many in self.bursts)
         return (stream + burst).astype(jnp.int32)
 
     @previous_is_optional
@@ -164,6 +183,8 @@ class Emitter:
         dtype = trees.time_dtype(state.position)
         values = draw_named({"moment of birth": Uniform(0.0, 1.0), **named}, key, block, dtype)
         since_step = dt * values.pop("moment of birth")
+        if self.path is not None:
+            values["position"], values["velocity"] = self._moving(t, values["position"], values["velocity"], since_step)
         values["position"] = values["position"] - since_step[:, None] * values["velocity"]
         for name in state.fields():
             if name in DEFAULTS and name not in values:
@@ -174,7 +195,22 @@ class Emitter:
         new = {name: put(name, getattr(state, name), value) for name, value in values.items()}
         return state.replace(**new, births=state.births + births, missed_births=state.missed_births + wanted - births)
 
+    def _moving(self, t: Any, position: Array, velocity: Array, since_step: Array) -> tuple[Array, Array]:
+        """Places and velocities of newborns on the path, each where it was at the moment of birth."""
+
+        def along(time):
+            return jax.jvp(self.path, (time,), (jnp.ones_like(time),))
+
+        place, speed = jax.vmap(along)(jnp.asarray(t, since_step.dtype) + since_step)
+        return position + place.astype(position.dtype), velocity + self.inherit * speed.astype(velocity.dtype)
+
     def check(self, particles: int, dim: int) -> None:
+        if self.path is not None:
+            form = checks.form_of("Emitter.path", self.path, 0.0)
+            checks.shape("Emitter.path(t)", getattr(form, "shape", ()), (dim,), meaning="one number a dimension")
+        if callable(self.rate):
+            form = checks.form_of("Emitter.rate", self.rate, 0.0)
+            checks.shape("Emitter.rate(t)", getattr(form, "shape", ()), ())
         count = min(self.max_births or particles, particles)
         for name in ("position", "velocity"):
             shape = jax.eval_shape(
@@ -202,6 +238,16 @@ def births_of_stream(n: Array, per_step: Array) -> Array:
     part = high.astype(jnp.uint32) * jnp.uint32(2**16) + ((share - high) * 2.0**16).astype(jnp.uint32)
     before = n.astype(jnp.uint32) * part + jnp.uint32(2**22)
     return whole.astype(jnp.int32) + (before + part < before).astype(jnp.int32)
+
+
+def births_by_turns(n: Array, per_step: Array) -> Array:
+    """p births in step n on average, for a p that changes: floor(p + the n-th of evenly spread fractions).
+
+    The fractions are those of n times the golden ratio, in 32 bits, so that sums over consecutive steps are as near
+    their mean as can be.
+    """
+    fraction = (n.astype(jnp.uint32) * jnp.uint32(2654435769) >> 8).astype(jnp.float32) * 2.0**-24
+    return jnp.floor(per_step + fraction.astype(per_step.dtype)).astype(jnp.int32)
 
 
 def step_number(t: Any, dt: Any) -> Array:

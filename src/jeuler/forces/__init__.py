@@ -7,13 +7,17 @@ from jeuler.forces.drag import LinearDrag, QuadraticDrag
 from jeuler.forces.fields import Gravity
 from jeuler.forces.friction import DryFriction
 from jeuler.forces.hair import StrandBending, StrandCore, strand_edges
+from jeuler.forces.links import BreakableSprings, CubicSprings, Strings
 from jeuler.forces.neighbours import Bending, Viscosity
 from jeuler.forces.soft_body import ShapeMatching
 from jeuler.forces.springs import Springs
+from jeuler.forces.torsion import Torsion
 
 __all__ = [
     "AppliedForce",
     "Bending",
+    "BreakableSprings",
+    "CubicSprings",
     "DryFriction",
     "Gravity",
     "Gust",
@@ -24,6 +28,8 @@ __all__ = [
     "Springs",
     "StrandBending",
     "StrandCore",
+    "Strings",
+    "Torsion",
     "Turbulence",
     "Viscosity",
     "Vortex",

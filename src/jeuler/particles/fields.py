@@ -99,7 +99,7 @@ def name_of(part: Any) -> str:
 def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: Iterable[Any]) -> ParticleState:
     """The state with every field that the effects write; ValueError if a field is missing or in conflict."""
     effects = tuple(effects)
-    shapes: dict[str, tuple[int, ...]] = {}
+    shapes: dict[str, Any] = {}
     for effect in effects:
         for fields in (declared(effect, "writes"), declared(effect, "sets")):
             shapes |= fields if isinstance(fields, dict) else {}

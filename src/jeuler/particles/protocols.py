@@ -112,9 +112,9 @@ class EffectHooks(Effect, Protocol):
     reads: tuple[str, ...]
     """Fields that must be in the state."""
 
-    writes: tuple[str, ...] | dict[str, tuple[int, ...]]
+    writes: tuple[str, ...] | dict[str, Any]
     """Fields that it changes for some particles: the state gets them if it has none. A dictionary says the shape of
-    one particle's value of fields that are not the library's own."""
+    one particle's value of fields that are not the library's own, or has a `FieldForm` for one of another type."""
 
     sets: tuple[str, ...] | dict[str, tuple[int, ...]]
     """Fields that it gives to every particle at each step: no other effect may write them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,19 @@ DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
     "shape": ((), 0),
     "frames": ((), 0),
 }
+
+
+class FieldForm(NamedTuple):
+    """A field of the user's own, or of an effect: shape, and value (of its type) where nothing gave one.
+
+    The shape is that of one particle's value, or of the field if it is ``whole``: one for the system.
+    """
+
+    shape: tuple[int, ...]
+    value: Any
+    whole: bool = False
+
+
 COUNTERS = ("births", "missed_births")  # one number for the whole pool, int32
 
 
@@ -55,7 +68,8 @@ class ParticleState:
         state goes on with those of the run that it was saved from.
       frames: (particle,) int32, the steps that a particle has lived, where `Lifetime` counts them.
       force: (particle, dim), N, what acted on each particle in the last step, where a user asks for it, see `simulate`.
-      extra: further fields by name, each (particle, ...) or (): a temperature, a team. Read as ``state.temperature``.
+      extra: further fields by name, each (particle, ...), or () or (1, ...) for one of the system: a temperature, a
+        team. Read as ``state.temperature``.
     Raises: ValueError, if a field is not an array of numbers; `simulate` checks the shapes.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -178,7 +192,7 @@ class ParticleState:
                     f"state.force must be an array as position, {self.position.dtype} {self.position.shape}, "
                     f"got {dtype} {shape}; write state.replace(force=jnp.zeros_like(state.position))"
                 )
-            if name in (self.extra or {}) and shape[:1] not in ((), (particles,)):
+            if name in (self.extra or {}) and shape[:1] not in ((), (particles,), (1,)):
                 raise ValueError(f"state.{name} must have shape () or ({particles}, ...), one a particle, got {shape}")
         if self.alive is not None and self.alive.dtype != bool:
             raise ValueError(
@@ -229,11 +243,11 @@ def empty_pool(capacity: int, dim: int, *, mass: Any = 1.0, dtype: Any = None) -
 
 
 def with_default_fields(
-    state: ParticleState, names: tuple[str, ...], shapes: dict[str, tuple[int, ...]] | None = None
+    state: ParticleState, names: tuple[str, ...], shapes: dict[str, Any] | None = None
 ) -> ParticleState:
     """The state with default values in those of the named fields that it lacks; mass becomes one a particle.
 
-    ``shapes``: of one particle's value, for fields of the user's own that are not one number.
+    ``shapes``: of one particle's value, or a `FieldForm`, for fields that are not the library's own.
     """
     particles, dtype = len(state.position), state.position.dtype
     values: dict[str, Array] = {}
@@ -244,9 +258,10 @@ def with_default_fields(
             if name in (*COUNTERS, "unresolved_contacts", "steps"):
                 values[name] = jnp.int32(0)
             else:
-                shape, value = DEFAULTS.get(name, ((shapes or {}).get(name, ()), 0.0))
+                form = DEFAULTS.get(name, (shapes or {}).get(name, ()))
+                shape, value, *whole = form if name in DEFAULTS or isinstance(form, FieldForm) else (form, 0.0)
                 kind = {bool: bool, int: jnp.int32}.get(type(value), dtype)
-                values[name] = jnp.full((particles, *shape), value, kind)
+                values[name] = jnp.full(shape if any(whole) else (particles, *shape), value, kind)
     return state.replace(**values) if values else state
 
 

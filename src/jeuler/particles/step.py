@@ -77,7 +77,7 @@ class SceneStep:
         ``in_step(f, t, y, dt, attributes)`` is f with it: v + dt f is the velocity after the forces, contact included.
         """
         collisions = [effect for effect in self.scene.effects if isinstance(effect, Collisions)]
-        if not collisions or getattr(self.step, "explicit", False):
+        if not collisions or getattr(self.step, "explicit", False) or not getattr(self.step, "solves_contact", True):
             return None
 
         def in_step(f, t, y, dt, attributes):

@@ -8,6 +8,7 @@ from jeuler.steps.implicit import (
     linearly_implicit_euler,
     linearly_implicit_euler_step,
 )
+from jeuler.steps.midpoint import implicit_midpoint_step
 from jeuler.steps.stability import StabilityLimit, stability_limit
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "heun_step",
     "implicit_euler",
     "implicit_euler_step",
+    "implicit_midpoint_step",
     "linearly_implicit_euler",
     "linearly_implicit_euler_step",
     "rk4_step",

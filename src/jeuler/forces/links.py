@@ -1,0 +1,236 @@
+"""Springs with a law of their own: cubic, that only pull, or that break."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jeuler._core import checks
+from jeuler._core.annotations import Parameter, ParticleIndices
+from jeuler._core.component import component, replace, store_as_float
+from jeuler._core.components import split, stack
+from jeuler._core.limits import check_limits
+from jeuler._core.vectors import apart, direction
+from jeuler.forces.springs import coefficient
+from jeuler.graphs.layouts import Layout
+from jeuler.graphs.topology import Topology
+
+STRENGTHS = ("ks", "kd", "cubic")  # what a link without one of its ends has not
+
+
+def cubic_coefficient(square: Array, approach: Array, ks: Array, kd: Array, rest_length: Array, cubic: Array) -> Array:
+    """The number c of a force c d on the first end, with s = r - L: c = -(ks s + cubic s^3 + kd a / r) / r."""
+    long = apart(square)
+    r = jnp.sqrt(jnp.where(long, square, 1))
+    return jnp.where(long, ks * rest_length - cubic * (r - rest_length) ** 3 - kd * (approach / r), 0) / r - ks
+
+
+def string_coefficient(square: Array, approach: Array, ks: Array, kd: Array, rest_length: Array) -> Array:
+    """c = -T / r with the tension T = ks (r - L) + kd a / r where r > L and T > 0, else 0."""
+    long = apart(square)
+    r = jnp.sqrt(jnp.where(long, square, 1))
+    tension = ks * (r - rest_length) + kd * (approach / r)
+    return jnp.where(long & (r > rest_length) & (tension > 0), -tension / r, 0)
+
+
+@component(static=("edges", "layouts", "law", "names", "read_again"))
+class PreparedLinks:
+    """Links as the kernels take them, with the parameters in the slots of each layout."""
+
+    edges: Topology
+    layouts: tuple[Layout, ...]
+    law: Callable[..., Array]
+    names: tuple[str, ...]
+    read_again: bool  # see `Layout.central_force`
+    parameters: Any  # of each name, what `Layout.to_slots` made of it
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, broken: Array | None = None) -> Array:
+        if broken is not None:
+            checks.shape("state.broken", broken.shape, (1, len(self.edges)), meaning="one a spring; see Breaking")
+            return self.only(~broken[0])(t, position, velocity, mass)
+        x, v = split(position), split(velocity)
+        total = [jnp.zeros_like(component) for component in x]
+        for layout, *parameters in zip(self.layouts, *self.parameters, strict=True):
+            shares = layout.central_force(self.law, x, v, parameters, self.read_again)
+            total = [a + b for a, b in zip(total, shares, strict=True)]
+        return stack(total)
+
+    def prepare(self, context: Any) -> PreparedLinks:
+        """Between the living only."""
+        return self if context.alive is None else self.only(jnp.all(context.alive[self.edges[:]], axis=1))
+
+    def only(self, which: Array) -> PreparedLinks:
+        """These links only, (link,) boolean."""
+        here = [layout.to_slots(which) for layout in self.layouts]
+
+        def only_here(name, parameter):
+            if name not in STRENGTHS:
+                return parameter
+            groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
+            return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
+
+        pairs = zip(self.names, self.parameters, strict=True)
+        return replace(self, parameters=[only_here(name, parameter) for name, parameter in pairs])
+
+
+class _Links:
+    """What the links share."""
+
+    edges: Any
+    rest_length: Any
+    law: ClassVar[Callable[..., Array]]
+    names: ClassVar[tuple[str, ...]] = ("ks", "kd", "rest_length")
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "edges", Topology(self.edges))
+        store_as_float(self, *self.names)
+
+    def prepare(self, context: Any) -> PreparedLinks | None:
+        """The links between the living, laid out for the kernels; None where there are none."""
+        if not len(self.edges):
+            return None
+        return self.laid_out(context.particles, context.dtype, context.limits_drag).prepare(context)
+
+    def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedLinks:
+        layouts = self.edges.layouts(particles)
+        values = [getattr(self, name).astype(dtype) for name in self.names]
+        slots = [[layout.to_slots(x) for layout in layouts] for x in values]
+        return PreparedLinks(self.edges, layouts, type(self).law, self.names, read_again, slots)
+
+    def check(self, particles: int, dim: int) -> None:
+        self.edges.check(particles)
+        for name in self.names:
+            where = f"{type(self).__name__}.{name}"
+            checks.shape(where, getattr(self, name).shape, (), (len(self.edges),), meaning="one a link")
+        check_limits(self)
+
+    def _stretch(self, position: Array) -> Array:
+        r, _ = direction(self.edges.difference(position))
+        return r[:, 0] - self.rest_length.astype(position.dtype)
+
+
+@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+class CubicSprings(_Links):
+    """Springs that grow stiffer, or softer, as they are stretched (Duffing's), with dampers.
+
+        s = r - L,   F_i = -(ks s + cubic s^3) u - kd ((v_i - v_j).u) u,   F_j = -F_i
+
+    Args:
+      edges: the two particles (i, j) of each spring, integers (spring, 2). Static.
+      ks: stiffness at rest length, () or (spring,), N/m. Differentiable.
+      kd: damping, () or (spring,), N s/m. Differentiable.
+      rest_length: L, () or (spring,), m. Differentiable.
+      cubic: () or (spring,), N/m^3; above 0 hardens, below 0 softens. Differentiable.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+    Raises: ValueError, if edges is not an integer (spring, 2) array; in `simulate`, if an index is out of range, a
+      parameter has another shape, or ks, kd or rest_length is negative.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> spring = jeuler.CubicSprings([[0, 1]], ks=10.0, kd=0.0, rest_length=1.0, cubic=2.0)
+      >>> spring(0.0, jnp.array([[0.0], [3.0]]), jnp.zeros((2, 1)), jnp.asarray(1.0)).tolist()
+      [[36.0], [-36.0]]
+
+    Source: G. Duffing, Erzwungene Schwingungen bei veraenderlicher Eigenfrequenz, 1918.
+    """
+
+    edges: ParticleIndices
+    ks: Parameter
+    kd: Parameter
+    rest_length: Parameter
+    cubic: Parameter
+
+    law: ClassVar[Callable[..., Array]] = staticmethod(cubic_coefficient)
+    names: ClassVar[tuple[str, ...]] = ("ks", "kd", "rest_length", "cubic")
+    limits: ClassVar[dict[str, Any]] = {
+        "ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m"), "cubic": ("", "N/m^3"),
+    }  # fmt: skip
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
+
+    def energy(self, t: Any, position: Array, mass: Array) -> Array:
+        """Potential energy sum ks s^2 / 2 + cubic s^4 / 4, J."""
+        s = self._stretch(position)
+        return jnp.sum(self.ks.astype(s.dtype) * s**2 / 2 + self.cubic.astype(s.dtype) * s**4 / 4)
+
+
+@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+class Strings(_Links):
+    """Strings: they pull where they are longer than their rest length, and are slack where they are shorter.
+
+        T = ks (r - L) + kd (v_i - v_j).u   where r > L and T > 0, else 0;   F_i = -T u,   F_j = -F_i
+
+    A damper does not make a string push.
+
+    Args:
+      edges: the two particles (i, j) of each string, integers (string, 2). Static.
+      ks: stiffness, () or (string,), N/m. Differentiable.
+      kd: damping, () or (string,), N s/m. Differentiable.
+      rest_length: L, () or (string,), m. Differentiable.
+    Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
+    Raises: ValueError, if edges is not an integer (string, 2) array; in `simulate`, if an index is out of range, or a
+      parameter has another shape or is negative.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> string = jeuler.Strings([[0, 1]], ks=10.0, kd=0.0, rest_length=1.0)
+      >>> [string(0.0, jnp.array([[0.0], [x]]), jnp.zeros((2, 1)), jnp.asarray(1.0))[0, 0].item() for x in (0.5, 1.5)]
+      [0.0, 5.0]
+    """
+
+    edges: ParticleIndices
+    ks: Parameter
+    kd: Parameter
+    rest_length: Parameter
+
+    law: ClassVar[Callable[..., Array]] = staticmethod(string_coefficient)
+    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
+
+    def energy(self, t: Any, position: Array, mass: Array) -> Array:
+        """Potential energy of the strings that are taut, sum ks (r - L)^2 / 2, J."""
+        s = jnp.maximum(self._stretch(position), 0)
+        return jnp.sum(self.ks.astype(s.dtype) * s**2) / 2
+
+
+@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+class BreakableSprings(_Links):
+    """Springs with dampers that are gone once they are broken: `Breaking` says which are.
+
+        F_i = ks (L - r) u - kd ((v_i - v_j).u) u where the spring holds, else 0;   F_j = -F_i
+
+    Args:
+      edges: the two particles (i, j) of each spring, integers (spring, 2). Static.
+      ks: stiffness, () or (spring,), N/m. Differentiable.
+      kd: damping, () or (spring,), N s/m. Differentiable.
+      rest_length: L, () or (spring,), m. Differentiable.
+    Returns: called as a force ``(t, position, velocity, mass, broken)``, the force on each particle, (particle, dim),
+      N; broken is (1, spring), boolean.
+    Raises: ValueError, in `simulate`, if the scene has no `Breaking` with as many springs, an index is out of range, or
+      a parameter has another shape or is negative.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> state = jeuler.ParticleState([[0.0], [1.0]], [[0.0], [4.0]], mass=[jnp.inf, 1.0])
+      >>> rope = jeuler.BreakableSprings([[0, 1]], ks=1.0, kd=0.0, rest_length=1.0)
+      >>> scene = jeuler.Scene((rope,), (jeuler.Breaking(rope, max_strain=0.5),))
+      >>> run = jeuler.simulate(scene, state, dt=0.25, num_steps=3, step=jeuler.symplectic_euler_step)
+      >>> run.y.position[:, 1, 0].tolist(), run.y.broken_springs.tolist()  # free from the first step on
+      ([1.0, 2.0, 3.0, 4.0], [0, 1, 1, 1])
+    """
+
+    edges: ParticleIndices
+    ks: Parameter
+    kd: Parameter
+    rest_length: Parameter
+
+    law: ClassVar[Callable[..., Array]] = staticmethod(coefficient)
+    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
+    reads: ClassVar[tuple[str, ...]] = ("broken",)
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, broken: Array) -> Array:
+        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass, broken)
