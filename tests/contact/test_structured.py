@@ -7,7 +7,7 @@ import pytest
 SCENES = 12
 
 
-@pytest.mark.parametrize("method", [0, 1, 3], ids=lambda k: list(contact_scenes.STEPS)[k])
+@pytest.mark.parametrize("method", [0, 1, 3, 5, 6], ids=lambda k: list(contact_scenes.STEPS)[k])
 def test_gradients_of_two_balls_a_floor_and_a_wall(method):
     shape = "two balls, floor and wall"
     random = np.random.default_rng(3)

@@ -36,6 +36,7 @@ def test_every_built_in_need_is_one_that_the_page_names():
             "clock",
             "forward time",
             "prescribed pinned",
+            "the solve",
         }
 
 

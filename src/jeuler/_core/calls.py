@@ -18,7 +18,7 @@ def previous_is_optional(method: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(method)
     def call(self: Any, t: Any, dt: Any, *rest: Any, **named: Any) -> Any:
-        if len(rest) + len(named) == 2:
+        if len(rest) + len(named.keys() & {"previous", "state", "key"}) == 2:
             rest = (None, *rest)
         return method(self, t, dt, *rest, **named)
 

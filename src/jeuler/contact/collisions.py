@@ -65,7 +65,7 @@ class Collisions:
     friction: Parameter = default(0.0)
     max_bounces: int | None = None
 
-    needs: ClassVar[tuple[str, ...]] = ("forward time", "prescribed pinned")
+    needs: ClassVar[tuple[str, ...]] = ("forward time", "prescribed pinned", "the solve")
 
     def __post_init__(self) -> None:
         if not isinstance(self.colliders, (tuple, list)):
@@ -86,14 +86,16 @@ class Collisions:
             checks.finite(f"Collisions.{name}", getattr(self, name))
 
     @previous_is_optional
-    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any, *, solved: bool = False) -> Any:
         if not self.colliders and not self.pairs:
             return state
         if previous is None:
             previous = dataclasses.replace(state, position=state.position - dt * state.velocity)
         x, v = previous.position, previous.velocity
         contacts = Contacts(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
-        position, velocity, unresolved = resolve(contacts, x, v, state.position, state.velocity, self._rounds())
+        position, velocity, unresolved = resolve(
+            contacts, x, v, state.position, state.velocity, self._rounds(), solved=solved
+        )
         before = state.unresolved_contacts
         count = before if before is None else before + unresolved
         return dataclasses.replace(state, position=position, velocity=velocity, unresolved_contacts=count)

@@ -20,7 +20,7 @@ implicit function theorem on the active set.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +70,14 @@ class Problem(NamedTuple):
         y_t = y - y_n * self.normal
         size, most = length(y_t)[:, None], self.contacts.friction * push
         held = size < most  # strictly: friction 0 holds nothing
-        return push * self.normal + jnp.where(held, y_t, y_t * (most / jnp.where(held | (size == 0), 1, size)))
+        rubbed = jnp.where(held, y_t, y_t * (most / jnp.where(held | (size == 0), 1, size)))
+        rubbed = jnp.where(push > self.weak(), rubbed, lax.stop_gradient(rubbed))  # a push of rounding holds nothing
+        return push * self.normal + rubbed
+
+    def weak(self) -> Array:
+        """A push, m/s, that may be a rounding, or what the iterations leave."""
+        speed = jnp.max(length(lax.stop_gradient(self.velocity)), initial=0)
+        return 100 * _relative_tolerance(speed.dtype) * speed
 
     def close(self) -> Array:
         """Who touches, or may be pushed into, (contact,)."""
@@ -109,14 +116,17 @@ class Problem(NamedTuple):
         return jnp.concatenate([unmoved, jnp.where(on, left + overlap, q)[:, None]], axis=1)
 
 
-def at_rest(problem: Problem, small: Array) -> Rest:
-    """The answer of the contacts that are active. Overlaps of ``small``, (contact,), m, are none."""
+def at_rest(problem: Problem, small: Array, *, solved: bool = False) -> Rest:
+    """The answer of the contacts that are active. Overlaps of ``small``, (contact,), m, are none.
+
+    ``solved``: the velocities may hold this answer already, so that what touches at both ends of the step presses.
+    """
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
-        weak = 1e-4 * jnp.max(length(problem.velocity), initial=0)
-        return lax.stop_gradient(active & (problem.push(w) > problem.push(velocity) + weak))
+        stays = jnp.abs(problem.gap) <= small + problem.weak() if solved else False
+        return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
     if len(contacts.colliders) == 1 and not len(contacts.i):  # each particle for itself: exact at once
         w = problem.project(-problem.velocity)
@@ -159,6 +169,11 @@ def _number_of_contacts(contacts: Contacts, active: Array) -> Array:
     return jnp.maximum(total, 1)
 
 
+def _relative_tolerance(dtype: Any) -> float:
+    """How near to the fixed point the iterations come, in parts of the largest velocity of the problem."""
+    return max(1e-9, 30 * float(jnp.finfo(dtype).eps))
+
+
 def _tolerated(problem: Problem) -> Array:
     """The velocity of a contact, m/s, that counts as none beside those of the problem."""
     speed = length(lax.stop_gradient(problem.velocity))
@@ -169,7 +184,7 @@ def _tolerated(problem: Problem) -> Array:
 def _iterate(problem: Problem, rate: Array, small: Array) -> tuple[Array, Array]:
     """The fixed point (contact, dim + 1) by accelerated iterations, and how far each contact, m/s, is from it."""
     velocity = problem.velocity
-    enough = jnp.maximum(1e-9, 30 * jnp.finfo(velocity.dtype).eps) * jnp.max(length(velocity), initial=0)
+    enough = _relative_tolerance(velocity.dtype) * jnp.max(length(velocity), initial=0)
     enough = enough + 0.01 * jnp.min(small, initial=jnp.inf)
 
     def one(state):

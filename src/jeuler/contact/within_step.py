@@ -27,24 +27,27 @@ def _kept(primitive: Any, *_: Any, name: str = "", label: str = "", **__: Any) -
     return name in (IMPACTS, REST) or label == REST or primitive is found_p
 
 
-@functools.partial(jax.jit, static_argnames="rounds")
+@functools.partial(jax.jit, static_argnames=("rounds", "solved"))
 def resolve(
-    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int
+    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, *, solved: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Position and velocity at the end of a step that led from (x, v) to (x_free, v_free), and what it left undone."""
-    step = functools.partial(_resolve, rounds=rounds)
+    """Position and velocity at the end of a step that led from (x, v) to (x_free, v_free), and what it left undone.
+
+    ``solved``: the step may have solved for its end with the forces of what rests.
+    """
+    step = functools.partial(_resolve, rounds=rounds, solved=solved)
     return jax.checkpoint(step, prevent_cse=False, policy=_kept)(contacts, x, v, x_free, v_free)
 
 
 def _resolve(
-    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int
+    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, solved: bool
 ) -> tuple[Array, Array, Array]:
     displacement, dv = x_free - x, v_free - v
     theta = share_of_the_force(displacement, v, dv, contacts.dt)
     contacts.near(free_path(x, displacement, dv, contacts.dt))
     slow = _slow(contacts, dv)
 
-    path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow)
+    path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, solved)
     contacts.lift_off(path)
     impacts = schedule(contacts, *lax.stop_gradient((path, slow, theta)), rounds)
     events, after, left = checkpoint_name(impacts, IMPACTS)
@@ -105,14 +108,15 @@ def _end(path: Path) -> tuple[Array, Array]:
 
 
 def hold(
-    contacts: Contacts, x: Array, v: Array, displacement: Array, dv: Array, theta: Array, slow: Array
+    contacts: Contacts, x: Array, v: Array, displacement: Array, dv: Array, theta: Array, slow: Array, solved: bool
 ) -> tuple[Path, Array, Array, Array, Array]:
     """The paths with the forces of what touches at the start and does not bounce, the velocity at their end, who is
     touched by them, the number of contacts that are not resolved, and who has a collider without a distance there."""
     (gap, _, normal, recession, _), small, stays = at_start(contacts, free_path(x, displacement, dv, contacts.dt), slow)
     end_speed = contacts.relative(v + dv) + recession[:, None] * normal
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
-    rest = at_rest(Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt), small)
+    problem = Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt)
+    rest = at_rest(problem, small, solved=solved)
     radius = contacts.both(jnp.add, contacts.radius)
     unclear = stays & (radius > 0) & (small > 0.05 * radius)  # far from the origin nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | unclear).astype(jnp.int32)

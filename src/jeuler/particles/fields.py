@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable)
 
 BEFORE, AFTER, START = ACTS = ("before motion", "after motion", "start and after motion")
 Acts = Literal["before motion", "after motion", "start and after motion"]
-Need = Literal["key", "clock", "forward time", "prescribed pinned"]
+Need = Literal["key", "clock", "forward time", "prescribed pinned", "the solve"]
 
 
 @says_what_to_write()

@@ -122,7 +122,9 @@ class EffectHooks(Effect, Protocol):
     needs: tuple[Need, ...]
     """What it cannot do without: "key", for random numbers; "clock", ``clock=(n, t0)`` in place of a
     keyword's default, n the steps taken before this one; "forward time", dt > 0; "prescribed pinned", mass inf of
-    prescribed particles as of pinned ones."""
+    prescribed particles as of pinned ones; "the solve", a place in the equation of steps that solve for their end:
+    ``answer(t, dt, state, acceleration)``, of the state at the start and the acceleration there, gives a function of
+    the velocities at the end, (particle, dim), to what is added to them, and the call gets ``solved=True``."""
 
     max_births: int | None
     """The most births in a step, None for no limit: windows must hold them."""

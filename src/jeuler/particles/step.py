@@ -15,7 +15,6 @@ from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.component import replace
 from jeuler._core.components import per_particle, split, stack
-from jeuler.contact.collisions import Collisions
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import BEFORE, acts, name_of, needs
 from jeuler.particles.loads import held, loads
@@ -76,8 +75,9 @@ class SceneStep:
 
         ``in_step(f, t, y, dt, attributes)`` is f with it: v + dt f is the velocity after the forces, contact included.
         """
-        collisions = [effect for effect in self.scene.effects if isinstance(effect, Collisions)]
-        if not collisions or getattr(self.step, "explicit", False) or not getattr(self.step, "solves_contact", True):
+        in_the_solve = [effect for effect in self.scene.effects if needs(effect, "the solve")]
+        explicit = getattr(self.step, "explicit", False)
+        if not in_the_solve or explicit or not getattr(self.step, "solves_contact", True):
             return None
 
         def in_step(f, t, y, dt, attributes):
@@ -85,7 +85,7 @@ class SceneStep:
             mass = self.with_prescribed_pinned(t, jnp.broadcast_to(attributes.mass, (len(x),)), x.dtype)
             state = ParticleState(x, v, mass, alive=attributes.alive)
             start = f(t, y, attributes)[1]
-            answers = [effect.answer(t, dt, state, start) for effect in collisions]
+            answers = [effect.answer(t, dt, state, start) for effect in in_the_solve]
 
             def with_contact(t, y, attributes):
                 slope, acceleration = f(t, y, attributes)
@@ -137,6 +137,8 @@ class SceneStep:
             if (acts(effect) == BEFORE) == early:
                 key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, number), k)
                 act = with_its_needs(effect, key, n, self.grid.t0)
+                if needs(effect, "the solve") and self.contact_in_the_solve() is not None:
+                    act = functools.partial(act, solved=True)
                 if needs(effect, "prescribed pinned") and self.equation.effects:
                     act = functools.partial(self._with_prescribed_pinned, act)
                 yield f"effects[{k}] {name_of(effect)}", act
@@ -192,8 +194,8 @@ def with_its_needs(effect: Any, key: Array | None, n: Any, t0: Array) -> Callabl
     clock = {"clock": (n, t0)} if needs(effect, "clock") else {}
     act = functools.partial(with_previous(effect, ""), key=key, **clock)
 
-    def with_counter(t: Any, dt: Any, previous: ParticleState, state: ParticleState) -> Any:
-        after = act(t, dt, previous, state)
+    def with_counter(t: Any, dt: Any, previous: ParticleState, state: ParticleState, **named: Any) -> Any:
+        after = act(t, dt, previous, state, **named)
         forgotten = isinstance(after, ParticleState) and after.steps is None and state.steps is not None
         return replace(after, steps=state.steps) if forgotten else after  # a state made anew knows nothing of the run
 
