@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ PyTree = Any
 AIM = 0.8  # of the target: an answer errs on the side of accuracy
 NEAR = 0.75  # of the aim: an error between this and the aim ends the search
 FACTOR = 3.0  # an error within this factor of the target is near it
+EDGE = 0.008  # part of the number of steps to which the edge of stability is found
 MARGIN = 0.01  # by which dt may be larger with the error still near the target
 FINENESS = 1e-3  # part of the number of steps below which the search makes no difference
 TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
@@ -155,7 +157,7 @@ class Search:
     def climb(self, num_steps: int, ladder: Ladder | None = None) -> Ladder | None:
         """Double the steps until the finest run's error is known, and meets the target or follows the order."""
         ladder, looked = Ladder(self.order) if ladder is None else ladder, False
-        while num_steps <= self.most:
+        while num_steps <= self.most or (num_steps <= self.ceiling and self._falling(ladder)):
             states = self.pilot(num_steps)
             ladder.add(num_steps, states[-1])
             if len(ladder.finals) >= 4 and self._trusted(ladder):
@@ -168,6 +170,10 @@ class Search:
                     return ladder
             num_steps *= 2
         return None
+
+    def _falling(self, ladder: Ladder) -> bool:
+        """Whether the last errors begin to fall as the order says, so that a few runs more may show it."""
+        return len(ladder.finals) >= 4 and bool(np.all(ladder.observed_orders()[-2:] > 0.5 * self.order))
 
     def _trusted(self, ladder: Ladder) -> bool:
         """Whether the extrapolated state is known well enough, now and one run before, to judge the target."""
@@ -316,17 +322,30 @@ class Search:
             if meets(num_steps):
                 break
             spent += num_steps
-            finer = FINE if num_steps <= self.planned // 64 else FINER
+            finer = FINE if num_steps <= self.planned // 32 else FINER
             num_steps = max(num_steps + 1, round(finer * num_steps))
         else:
             return None
         fewer = [n for n in map(math.ceil, np.linspace(num_steps / FINER, num_steps, 10)) if n >= least]
         if error_of(num_steps) < 1 / FACTOR and not many:
             num_steps = next((n for n in fewer if meets(n)), num_steps)
-        if error_of(num_steps) < 1 / FACTOR and max(beside(num_steps)) > 1:
+        if math.isinf(error_of(round(num_steps / FINER))):
+            num_steps = self.on_edge(error_of, num_steps)
+        elif error_of(num_steps) < 1 / FACTOR and max(beside(num_steps)) > 1:
             more = [*fewer, *np.ceil(num_steps * np.linspace(1.01, ACCIDENT, 30)).astype(int).tolist()]
             num_steps = next((n for n in more if n <= self.most and near(n)), num_steps)
         return num_steps, error_of(num_steps) * self.error * self.scale(final)
+
+    def on_edge(self, error_of: Callable[[int], float], high: int) -> int:
+        """The fewest steps, to a hundredth, that meet the aim and are stable, as they are with dt 1 % larger."""
+        low = round(high / FINER)
+        while high - low > max(1, EDGE * high):
+            middle = (low + high) // 2
+            if error_of(middle) <= AIM and error_of(math.ceil(middle * (1 - MARGIN))) <= FACTOR:
+                high = middle
+            else:
+                low = middle
+        return high
 
     def error_after(self, num_steps: int, final: np.ndarray) -> float:
         """Error of a run in terms of the target; inf where it is not finite."""
