@@ -7,6 +7,7 @@ import pathlib
 import re
 import subprocess
 import sys
+import tomllib
 
 import cases
 import pytest
@@ -109,3 +110,10 @@ def test_no_module_shares_its_name_with_a_public_function():
 
 def test_two_files_stand_at_the_top_of_the_package():
     assert sorted(path.name for path in SOURCE.glob("*.py")) == ["__init__.py", "__main__.py"]
+
+
+def test_the_version_is_the_same_everywhere():
+    written = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert jeuler.__version__ == written
+    assert f"\nversion: {written}\n" in (ROOT / "CITATION.cff").read_text()
+    assert (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1].startswith(f"{written} (")

@@ -1,8 +1,8 @@
 """Pictures and films: what is drawn is what the state says."""
 
 import dataclasses
-import shutil
 import subprocess
+import sys
 
 import matplotlib
 
@@ -22,6 +22,7 @@ from jeuler.contact.colliders import Box, Plane, Sphere
 from jeuler.contact.collisions import Collisions
 from jeuler.plotting import Camera, Look, animate, draw
 from jeuler.plotting.camera import View, new_axes
+from jeuler.plotting.film import ffmpeg
 from jeuler.plotting.render import save_picture
 from jeuler.plotting.solids import draw_colliders, in_sight
 
@@ -109,14 +110,14 @@ def test_a_film_is_written_as_gif_and_html_and_shown_in_a_notebook(tmp_path, cap
 
 def test_mp4_needs_ffmpeg_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(animation.FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(RuntimeError, match=r"film.mp4 needs the program ffmpeg.*write film.gif or film.html"):
         animate(film(), path=tmp_path / "film.mp4", progress=False)
 
 
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="writes MP4, which needs ffmpeg on the PATH")
 def test_the_frames_of_an_mp4_are_those_of_the_film(tmp_path):
     animate(film(), path=tmp_path / "film.mp4", camera=Camera(width=3.0), progress=False)
-    subprocess.run(["ffmpeg", "-v", "error", "-i", tmp_path / "film.mp4", tmp_path / "frame%d.png"], check=True)
+    subprocess.run([ffmpeg(), "-v", "error", "-i", tmp_path / "film.mp4", tmp_path / "frame%d.png"], check=True)
     assert len(list(tmp_path.glob("frame*.png"))) == FRAMES
     save_picture(
         tmp_path / "expected.png", jax.tree.map(lambda x: x[2], film().y), camera=Camera([0.5, 0.5], width=3.0)

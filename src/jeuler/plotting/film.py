@@ -30,7 +30,8 @@ def animate(
     Args:
       solution: what `simulate` returned, its ``.y`` a `ParticleState` with leading axis saved.
       scene: the `Scene`, for its springs and colliders.
-      path: ".gif" is written by Pillow, ".mp4" by ffmpeg, ".html" holds a player; None writes nothing yet.
+      path: ".gif" is written by Pillow, ".mp4" by ffmpeg (of the PATH, or ``pip install
+        'jeuler[plot]'``), ".html" holds a player; None writes nothing yet.
       fps: frames a second of the film.
       every: takes each every-th saved state.
       size, dpi: of the picture, inches and dots an inch.
@@ -95,17 +96,18 @@ class Film:
         if path.suffix == ".gif":
             return GifWriter(fps=self.fps)
         if path.suffix == ".mp4":
-            if not animation.FFMpegWriter.isAvailable():
+            if ffmpeg() is None:
                 raise RuntimeError(
-                    f"writing {path.name} needs the program ffmpeg, which is not on the PATH; "
-                    f"install it, or write {path.with_suffix('.gif').name} or {path.with_suffix('.html').name}"
+                    f"writing {path.name} needs the program ffmpeg, which is not on the PATH; install it or "
+                    f"'jeuler[plot]', or write {path.with_suffix('.gif').name} or {path.with_suffix('.html').name}"
                 )
             return animation.FFMpegWriter(fps=self.fps)
         raise ValueError(f"the film's path must end in .gif, .mp4 or .html, got {path.name!r}")
 
     def write(self, path: Any, writer: Any) -> None:
         figure, pictures = self._draw_all()
-        with writer.saving(figure, str(path), dpi=self.dpi):
+        settings = {"animation.ffmpeg_path": ffmpeg() or "ffmpeg"}
+        with matplotlib.rc_context(settings), writer.saving(figure, str(path), dpi=self.dpi):
             for _ in pictures:
                 writer.grab_frame(facecolor=self.look.background)
         plt.close(figure)
@@ -142,6 +144,17 @@ class Film:
                 yield
 
         return ax.figure, frames()
+
+
+def ffmpeg() -> str | None:
+    """The program ffmpeg: that of the PATH, or the one that the package imageio-ffmpeg brings; None without either."""
+    if animation.FFMpegWriter.isAvailable():
+        return str(matplotlib.rcParams["animation.ffmpeg_path"])
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        return None
+    return str(imageio_ffmpeg.get_ffmpeg_exe())
 
 
 class GifWriter(animation.PillowWriter):
