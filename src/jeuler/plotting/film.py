@@ -106,8 +106,8 @@ class Film:
 
     def write(self, path: Any, writer: Any) -> None:
         figure, pictures = self._draw_all()
-        settings = {"animation.ffmpeg_path": ffmpeg() or "ffmpeg"}
-        with matplotlib.rc_context(settings), writer.saving(figure, str(path), dpi=self.dpi):
+        program = ffmpeg() or "ffmpeg"
+        with matplotlib.rc_context({"animation.ffmpeg_path": program}), writer.saving(figure, str(path), dpi=self.dpi):
             for _ in pictures:
                 writer.grab_frame(facecolor=self.look.background)
         plt.close(figure)
