@@ -6,8 +6,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from jeuler._core import checks
 from jeuler._core.component import unwrapped
+from jeuler._core.signatures import signature_of
 
 
 def previous_is_optional(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -32,7 +32,7 @@ def with_previous(effect: Callable[..., Any], name: str) -> Callable[..., Any]:
     """
     if hasattr(effect, "over_step"):  # what effects of the user's own had for this before `previous`
         return effect.over_step
-    signature = checks.signature_of(unwrapped(effect))
+    signature = signature_of(unwrapped(effect))
     if signature is None or "previous" in signature.parameters or not _takes(signature, 4):
         if signature is not None and not _takes(signature, 5):
             raise ValueError(

@@ -6,7 +6,6 @@ Values that are being traced cannot be looked at, so value checks pass over them
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import math
 import operator
 from typing import Any
@@ -14,6 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jeuler._core.signatures import signature_of
 
 
 def is_traced(x: Any) -> bool:
@@ -34,6 +35,8 @@ def shown(x: Any, most: int = 60) -> str:
 
 def number(name: str, x: Any) -> None:
     """x is a finite real scalar."""
+    if type(x) is float and math.isfinite(x):
+        return
     expected = f"{name} must be one finite real number"
     if is_traced(x):
         if x.ndim or not jnp.issubdtype(x.dtype, jnp.floating):
@@ -272,14 +275,6 @@ def function(name: str, f: Any, form: str, hint: str) -> None:
             signature.bind(*form.split("->")[0].split(","))
     except TypeError:
         raise ValueError(f"{name} must be a function {form}, got {shown(f)}{signature}; {hint}") from None
-
-
-def signature_of(f: Any) -> inspect.Signature | None:
-    """The signature of f; None where Python does not know it, as of some built-in functions."""
-    try:
-        return inspect.signature(f)
-    except (TypeError, ValueError):
-        return None
 
 
 def random_key(key: Any) -> None:

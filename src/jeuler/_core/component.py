@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from typing import Any, TypeVar, dataclass_transform
 
@@ -39,10 +40,13 @@ def component(
         constructor_says_what_to_write(cls)
         names = tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]  # made one above
         children = tuple(name for name in names if name not in static)
+        order = (*children, *static)
         keys = tuple(jax.tree_util.GetAttrKey(name) for name in children)
 
+        values_of, static_of = _getter(children), _getter(static)
+
         def flatten(x: T):
-            return tuple(getattr(x, n) for n in children), tuple(getattr(x, n) for n in static)
+            return values_of(x), static_of(x)
 
         def flatten_with_keys(x: T):
             values, aux = flatten(x)
@@ -50,8 +54,7 @@ def component(
 
         def unflatten(aux: Any, values: Any) -> T:
             x = object.__new__(cls)
-            for name, value in zip((*children, *static), (*values, *aux), strict=True):
-                object.__setattr__(x, name, value)
+            vars(x).update(zip(order, (*values, *aux), strict=True))
             return x
 
         jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
@@ -59,6 +62,13 @@ def component(
         return cls
 
     return decorate
+
+
+def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple[Any, ...]]:
+    """A function that takes the tuple of these attributes; flattening is most of what a short run costs."""
+    if len(names) > 1:
+        return operator.attrgetter(*names)
+    return lambda x: tuple([getattr(x, name) for name in names])
 
 
 @dataclass_transform(frozen_default=True)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jeuler._core import checks
 
@@ -22,7 +25,9 @@ def check_limits(component: Any) -> None:
     infinite = getattr(type(component), "may_be_infinite", ())
     for name, (rule, unit) in getattr(type(component), "limits", {}).items():
         value = getattr(component, name)
-        if value is None or callable(value) or checks.is_traced(value):
+        if value is None or checks.is_traced(value) or callable(value):
+            continue
+        if _is_within(value, rule, name in infinite):
             continue
         where = f"{type(component).__name__}.{name}"
         if rule == "> 0":
@@ -30,6 +35,16 @@ def check_limits(component: Any) -> None:
         elif rule == ">= 0":
             checks.not_negative(where, value, unit)
         checks.finite(where, value, infinite=name in infinite)
+
+
+def _is_within(value: Any, rule: str, infinite: bool) -> bool:
+    """Whether floating numbers are surely right: from the least and the largest of them, NaN where there is one."""
+    value = np.asarray(value)
+    if value.dtype.kind != "f" or not value.size:
+        return False
+    least, largest = (value.item(), value.item()) if not value.ndim else (value.min(), value.max())
+    above = least > 0 if rule == "> 0" else least >= 0 if rule else infinite or least > -math.inf
+    return bool(above and (least == least if infinite else largest < math.inf))
 
 
 def check_axes(component: Any) -> None:
@@ -52,13 +67,26 @@ def check_parameters(name: str, x: Any) -> None:
     if dataclasses.is_dataclass(x) and not isinstance(x, type):
         check_limits(x)
         check_axes(x)
-        for field in dataclasses.fields(x):
-            check_parameters(f"{name}.{field.name}", getattr(x, field.name))
+        limits = getattr(type(x), "limits", {})
+        for field in _fields(type(x)):
+            value = getattr(x, field)
+            if value is not None and not (field in limits and isinstance(value, jax.Array)):
+                check_parameters(f"{name}.{field}", value)
     elif isinstance(x, (tuple, list)):
         for k, part in enumerate(x):
             check_parameters(f"{name}[{k}]", part)
     elif isinstance(x, dict):
         for key, part in x.items():
             check_parameters(f"{name}[{key!r}]", part)
-    elif isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact) and not checks.is_traced(x):
+    elif _is_inexact(x) and not _is_within(x, "", infinite=True):
         checks.finite(name, x, infinite=True)
+
+
+def _is_inexact(x: Any) -> bool:
+    """Whether an array of floating or complex numbers that can be looked at."""
+    return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.inexact) and not checks.is_traced(x)
+
+
+@functools.lru_cache(maxsize=256)
+def _fields(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind))

@@ -12,6 +12,8 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 
+from jeuler._core.precision import setting
+
 PyTree = Any
 
 
@@ -22,8 +24,14 @@ def real_dtype(dtype: Any) -> Any:
 
 def time_dtype(y: PyTree) -> Any:
     """The dtype of t and dt for a state: its widest real dtype, float32 at least."""
-    leaves = [real_dtype(leaf.dtype) for leaf in jax.tree.leaves(y)]
-    return jnp.result_type(jnp.float32, *leaves) if leaves else jnp.result_type(float)
+    leaves = jax.tree.leaves(y)
+    dtypes = frozenset([leaf.dtype for leaf in leaves])
+    return _widest(dtypes, setting("jax_enable_x64")) if leaves else jnp.result_type(float)
+
+
+@functools.lru_cache(maxsize=64)
+def _widest(dtypes: frozenset[Any], x64: bool) -> Any:
+    return jnp.result_type(jnp.float32, *map(real_dtype, dtypes))
 
 
 def add(x: PyTree, y: PyTree) -> PyTree:

@@ -66,7 +66,7 @@ def parts_of(x: Any) -> Parts:
         return Parts((kind, x))
     if isinstance(x, type):
         return Parts(x) if trusted(x.__module__) else _of_class(x)
-    if kind in HELD or (trusted(kind.__module__) and _is_named(x)):
+    if kind in HELD or (trusted(kind.__module__) and is_named(x)):
         return Parts(_Held(x))
     if isinstance(x, tuple) and hasattr(x, "_fields"):
         return Parts(kind, tuple(x), kind._make)
@@ -89,7 +89,7 @@ class _Held:
         return id(self.x)
 
 
-def _is_named(x: Any) -> bool:
+def is_named(x: Any) -> bool:
     """Whether a module that does not change has this object under its name."""
     module, name = sys.modules.get(getattr(x, "__module__", None) or ""), getattr(x, "__qualname__", None)
     return module is not None and name is not None and trusted(module.__name__) and getattr(module, name, None) is x
@@ -127,7 +127,7 @@ def _of_numpy(x: Any) -> Parts:
 
 
 def _of_function(f: types.FunctionType) -> Parts:
-    if trusted(f.__module__) and _is_named(f):
+    if trusted(f.__module__) and is_named(f):
         return Parts(_Held(f))
     code, names = f.__code__, named_in(f.__code__)
     cells = [_contents(cell) for cell in f.__closure__ or ()]

@@ -21,11 +21,12 @@ from typing import Any
 import jax
 import numpy as np
 from jax._src import core  # which trace is at work: no public name says it without warnings
+from jax._src.array import ArrayImpl
 
 from jeuler._core.component import Function, Partitioned
 from jeuler._core.precision import setting
 from jeuler._jax.apart import apart
-from jeuler._jax.captured import CYCLE, Opaque, WithArrays, token, trusted
+from jeuler._jax.captured import CYCLE, Opaque, WithArrays, is_named, token, trusted
 from jeuler._jax.placed import is_placed, may_be_placed
 
 MOST = 128  # programs kept; the one not used for the longest goes first
@@ -60,7 +61,8 @@ class Kept:
 
 
 by_structure, by_text = Kept(MOST), Kept(MOST)
-current = threading.local()  # the leaves of the call that is being traced
+by_whole = Kept(MOST)  # the same programs, by the structure of inputs in which nothing has to be looked into
+current = threading.local()  # the inputs of the call that is being traced
 
 
 def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
@@ -82,18 +84,33 @@ def prepared(function: Callable, inputs: tuple, settings: tuple = ()) -> Call:
 
     What comes back takes the memory of the first of these, which cannot be used again.
     """
+    plain, whole = jax.tree.flatten(inputs)
+    if all(map(_is_plain, plain)):
+        try:
+            program = by_whole.get((function, settings, whole))
+        except TypeError:  # something that has no hash
+            program = None
+        if program is not None:
+            return Call(function, settings, inputs, program, plain, [])
+    return _compared(function, inputs, settings, whole)
+
+
+def _compared(function: Callable, inputs: tuple, settings: tuple, whole: Any) -> Call:
+    """`prepared`, of inputs whose functions have to be compared by what they can reach."""
     classes: set[type] = set()
-    leaves, structure = jax.tree.flatten(inputs, is_leaf=functools.partial(_stands_alone, classes))
+    leaves, structure = _flattened(inputs, classes)
     try:
         dynamic, arrays, tokens = _tokens(leaves)
         own = tuple([token(kind, None, {}) for kind in sorted(classes, key=id)])
         key = function, settings, structure, tokens, own
         program = by_structure.get(key)
     except (Opaque, TypeError):  # a TypeError: something that has no hash
-        return Call(function, settings, leaves, structure)
+        return Call(function, settings, inputs)
     if program is None:
         program = by_structure.put(key, Program(function, settings, structure, tokens))
-    return Call(function, settings, leaves, structure, program, dynamic, arrays)
+    if not classes and all(map(_is_constant, leaves)):
+        by_whole.put((function, settings, whole), program)
+    return Call(function, settings, inputs, program, dynamic, arrays)
 
 
 class Call:
@@ -103,13 +120,12 @@ class Call:
         self,
         function: Callable,
         settings: tuple,
-        leaves: list,
-        structure: Any,
+        inputs: tuple,
         program: Program | None = None,
         dynamic: list | None = None,
         arrays: list | None = None,
     ) -> None:
-        self.of_call = function, settings, leaves, structure
+        self.of_call = function, settings, inputs
         self.program, self.dynamic, self.arrays = program, dynamic, arrays
         self.notes: dict[Any, Any] = {} if program is None else program.notes
         self.compiled: Callable | None = None
@@ -139,22 +155,22 @@ class Program:
         self.notes: dict[Any, Any] = {}  # what its callers keep with it
 
         def run(dynamic, arrays, first, rest):
-            leaves = _put_together(current.leaves, tokens, dynamic, arrays)
+            leaves = _put_together(_flattened(current.inputs)[0], tokens, dynamic, arrays)
             return function(*jax.tree.unflatten(structure, leaves), *settings, *first, *rest)
 
         self.compiled = jax.jit(apart(run), donate_argnums=2)
 
-    def __call__(self, leaves: list, dynamic: list | None, arrays: list | None, further: tuple) -> Any:
-        before, current.leaves = getattr(current, "leaves", None), leaves
+    def __call__(self, inputs: tuple, dynamic: list | None, arrays: list | None, further: tuple) -> Any:
+        before, current.inputs = getattr(current, "inputs", None), inputs
         try:
             return self.compiled(dynamic, arrays, further[:1], further[1:])
         finally:
-            current.leaves = before
+            current.inputs = before
 
 
 def _on_a_mesh(function: Callable, inputs: tuple, settings: tuple) -> Any:
     """function(*inputs, *settings) while a program is traced, where arrays may be on a mesh of explicit axes."""
-    leaves, structure = jax.tree.flatten(inputs, is_leaf=functools.partial(_stands_alone, set()))
+    leaves, structure = _flattened(inputs)
     placed = any(is_placed(leaf) for leaf in leaves if isinstance(leaf, jax.Array))
     try:
         dynamic, arrays, tokens = _tokens(leaves) if placed or may_be_placed() else ((), (), None)
@@ -175,8 +191,9 @@ def _put_together(leaves: list, tokens: tuple, dynamic: Any, arrays: Any) -> lis
     return [next(given) if name is None else made.of(leaf) for leaf, name in zip(leaves, tokens, strict=True)]
 
 
-def _traced_again(function: Callable, settings: tuple, leaves: list, structure: Any, further: tuple) -> Callable:
+def _traced_again(function: Callable, settings: tuple, inputs: tuple, further: tuple) -> Callable:
     """The function of what is ``further``, traced for this call alone; what was compiled of the same text is used."""
+    leaves, structure = _flattened(inputs)
     is_dynamic = [_is_dynamic(leaf) for leaf in leaves]
     dynamic = [leaf for leaf, d in zip(leaves, is_dynamic, strict=True) if d]
 
@@ -231,6 +248,25 @@ def _is_dynamic(leaf: Any) -> bool:
     if type(leaf) in NUMBERS or isinstance(leaf, jax.Array):
         return True
     return isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype.kind not in "OSUMm"
+
+
+def _is_plain(leaf: Any) -> bool:
+    """Whether a leaf is surely an input of the program, and traced by nothing around."""
+    kind = type(leaf)
+    return kind is ArrayImpl or kind in NUMBERS or (kind is np.ndarray and leaf.dtype.kind in "fciub")
+
+
+def _is_constant(leaf: Any) -> bool:
+    """Whether an input, or a function that is the same whenever it is the same object."""
+    if type(leaf) is not Function:
+        return _is_dynamic(leaf)
+    f = leaf.function
+    return f is None or is_named(f)
+
+
+def _flattened(inputs: tuple, classes: set[type] | None = None) -> tuple[list, Any]:
+    """The leaves of the inputs and their structure; functions and the like are leaves."""
+    return jax.tree.flatten(inputs, is_leaf=functools.partial(_stands_alone, set() if classes is None else classes))
 
 
 def _stands_alone(classes: set[type], x: Any) -> bool:

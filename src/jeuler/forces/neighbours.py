@@ -14,7 +14,7 @@ from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.indices import Indices
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
-from jeuler.graphs.topology import Topology
+from jeuler.graphs.topology import topology
 
 
 @component(static=("edges",), positive=("coefficient",))
@@ -46,7 +46,7 @@ class Viscosity:
     limits: ClassVar[dict[str, Any]] = {"coefficient": (">= 0", "N s/m")}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "edges", Topology(self.edges))
+        object.__setattr__(self, "edges", topology(self.edges))
         store_as_float(self, "coefficient")
         check_limits(self)
 

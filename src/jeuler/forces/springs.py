@@ -17,7 +17,7 @@ from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
 from jeuler.graphs.layouts import Layout
-from jeuler.graphs.topology import Topology
+from jeuler.graphs.topology import Topology, topology
 
 
 @jax.custom_jvp
@@ -98,7 +98,7 @@ class Springs:
     limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "edges", Topology(self.edges))
+        object.__setattr__(self, "edges", topology(self.edges))
         for name in PARAMETERS:
             if callable(getattr(self, name)):
                 object.__setattr__(self, name, moving(f"Springs.{name}", getattr(self, name)))

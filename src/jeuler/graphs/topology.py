@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import weakref
 from typing import Any
 
 import jax.numpy as jnp
@@ -70,6 +72,27 @@ class Topology(Indices):
         """B^T f: (spring, dim) to (particle, dim)."""
         total = jnp.zeros((particles, *force.shape[1:]), force.dtype)
         return total.at[self[:, 0]].add(force).at[self[:, 1]].add(-force)
+
+
+def topology(edges: Any) -> Topology:
+    """The `Topology` of these edges: the one made before of the same, while something holds it."""
+    if isinstance(edges, Topology):
+        return edges
+    if isinstance(edges, (list, np.ndarray)):
+        try:
+            array = np.asarray(edges)
+        except (TypeError, ValueError):  # rows of several lengths, or traced: told by what follows
+            return Topology(edges)
+        if array.dtype.kind in "iu":
+            key = array.shape, array.dtype, hashlib.sha1(np.ascontiguousarray(array)).digest()
+            made = _made.get(key)
+            if made is None:
+                made = _made[key] = Topology(array)
+            return made
+    return Topology(edges)
+
+
+_made: weakref.WeakValueDictionary[Any, Topology] = weakref.WeakValueDictionary()
 
 
 @functools.lru_cache(maxsize=64)

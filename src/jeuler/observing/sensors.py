@@ -11,6 +11,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, default
 from jeuler._core.component import as_component, component, store_as_float
+from jeuler._core.signatures import signature_of
 from jeuler.observing.quantities import Acceleration, Position, Velocity
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -93,7 +94,7 @@ def as_observation(observe: Any) -> Any:
         raise ValueError(f"{expected}, got {checks.shown(observe)}{hint}")
     if type(observe).__module__.startswith("jeuler.observing"):
         return observe
-    signature = checks.signature_of(observe)
+    signature = signature_of(observe)
     names = [] if signature is None else [p.name for p in signature.parameters.values() if p.default is p.empty]
     if len(names) not in (2, 3):
         raise ValueError(f"{expected}, got {checks.shown(observe)} of {len(names)} arguments")

@@ -12,6 +12,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.calls import with_previous
 from jeuler._core.component import as_component, component, replace
+from jeuler._core.signatures import signature_of
 from jeuler.particles import loads
 from jeuler.particles.equation import Attributes, Equation
 from jeuler.particles.fields import declared, name_of, with_required_fields
@@ -234,7 +235,7 @@ def _check_part(name: str, part: Any) -> None:
     if not callable(part):
         hint = "; a collider acts through Collisions((...,)) or PenaltyContact" if hasattr(part, "normal") else ""
         raise ValueError(f"{expected}, got {checks.shown(part)}{hint}")
-    signature = checks.signature_of(part)
+    signature = signature_of(part)
     arguments = set(signature.parameters) if signature else set()
     if name == "forces" and {"dt", "state"} <= arguments:
         raise ValueError(f"{name_of(part)} is an effect, (t, dt, state, key) -> state; put it in Scene.effects")

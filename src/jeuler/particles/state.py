@@ -123,7 +123,7 @@ class ParticleState:
     def fields(self) -> tuple[str, ...]:
         """The names of the fields that are there."""
         there = vars(self)  # not getattr: copy and pickle ask an object for attributes before it has any
-        own = [f.name for f in dataclasses.fields(self) if f.name != "extra" and there.get(f.name) is not None]
+        own = [name for name in _OWN if there.get(name) is not None]
         return (*own, *(there.get("extra") or {}))
 
     def replace(self, **values: Any) -> ParticleState:
@@ -172,8 +172,8 @@ class ParticleState:
         checks.shape("state.mass", self.mass.shape, (), shape[:1], meaning="one a particle")
         if not checks.is_traced(self.mass):
             mass = np.asarray(self.mass).astype(self.position.dtype).ravel()
-            bad = np.flatnonzero(~(mass > 0))
-            if bad.size:
+            if not np.all(mass > 0):
+                bad = np.flatnonzero(~(mass > 0))
                 raise ValueError(
                     f"state.mass must be greater than 0 kg (inf pins a particle), got {mass[bad[0]]} "
                     f"at particle {bad[0]}"
@@ -198,6 +198,9 @@ class ParticleState:
             raise ValueError(
                 f"state.alive must be boolean, got {self.alive.dtype}; write for example alive=(alive > 0)"
             )
+
+
+_OWN = tuple(field.name for field in dataclasses.fields(ParticleState) if field.name != "extra")
 
 
 def _array(name: str, value: Any) -> Array:

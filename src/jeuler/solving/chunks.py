@@ -61,7 +61,7 @@ def run_in_chunks(
     """
     if programs.is_transformed() or (setting("jax_disable_jit") and not progress):
         return None
-    numbers = max(FEWEST, sum(np.size(x) for x in jax.tree.leaves(inputs) if hasattr(x, "dtype")))
+    numbers = max(FEWEST, sum([getattr(x, "size", 0) for x in jax.tree.leaves(inputs)]))
     if not progress and grid.num_steps * numbers < LONG:
         return None
     try:

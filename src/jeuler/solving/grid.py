@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import warnings
 from typing import Any, Literal
@@ -83,7 +84,7 @@ def check_time_step(dt: Any, t0: Any, dtype: Any) -> None:
         return
     if not float(dt):
         raise ValueError("dt must not be 0 s: the run would stand still; negative steps back in time")
-    largest, tiny = float(jnp.finfo(dtype).max), float(jnp.finfo(dtype).tiny)
+    tiny, largest = _range(dtype)
     if not tiny <= abs(float(dt)) <= largest:
         raise ValueError(
             f"dt must be from {tiny:.2g} to {largest:.2g} s in {jnp.dtype(dtype).name}, the precision of the state, "
@@ -100,6 +101,12 @@ def check_time_step(dt: Any, t0: Any, dtype: Any) -> None:
             f"the state: what depends on t sees it stand still; count t from a nearer t0, or take a state in float64",
             stacklevel=4,
         )
+
+
+@functools.lru_cache(maxsize=16)
+def _range(dtype: Any) -> tuple[float, float]:
+    """The least and the largest normal number."""
+    return float(jnp.finfo(dtype).tiny), float(jnp.finfo(dtype).max)
 
 
 def _segment_length(checkpoint: Checkpoint, num_steps: int) -> int | None:
