@@ -85,6 +85,9 @@ def recovered(x, edges, mass, random):
     for name, truth in (("ks", ks), ("kd", kd)):
         error = np.abs(np.asarray(found.params[name]) / truth - 1)
         print(f"  {name}: median error {np.median(error):.3%}, worst {error.max():.2%}", flush=True)
+        if found.stderr is not None:
+            off = np.abs(np.asarray(found.params[name]) - truth) / np.asarray(found.stderr[name])
+            print(f"    95 % intervals hold {np.mean(off < 1.96):.1%}", flush=True)
 
 
 def chain(count, seed=0):

@@ -1,12 +1,16 @@
 """Fits without a Jacobian: the same answers as with one, between bounds, with outliers, interrupted and taken up."""
 
+import copy
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import jeuler
-from jeuler.fitting import minimise
+from jeuler.fitting import matrix_free, minimise
 from jeuler.fitting import problem as problems
+from jeuler.fitting import report as reports
 from jeuler.fitting.matrix_free import conjugate_gradients
 
 T = np.linspace(0, 4, 60)
@@ -25,8 +29,10 @@ def data(outliers=0):
 
 @pytest.fixture
 def without_a_jacobian(monkeypatch):
-    def switch():
+    def switch(most_errors=0):
         monkeypatch.setattr(problems, "MOST_COLUMNS", 0)
+        monkeypatch.setattr(reports, "MOST_COLUMNS", 0)
+        monkeypatch.setattr(matrix_free, "MOST_ERRORS", most_errors)
 
     return switch
 
@@ -43,6 +49,7 @@ def test_agrees_with_the_fit_that_forms_it(loss, bounds, start, without_a_jacobi
     assert found.converged
     assert found.stderr is None
     assert "not computed for 12 unknowns" in found.message
+    np.testing.assert_allclose(found.standard_error("a[1]"), formed.stderr["a"][1], rtol=0.3)
     for name in TRUTH:
         np.testing.assert_allclose(found.params[name], formed.params[name], atol=0.1 * np.max(formed.stderr[name]))
     assert found.at_bound == formed.at_bound
@@ -103,3 +110,71 @@ def test_conjugate_gradients_solve_and_say_what_is_left(random):
     assert b @ best * 0.95 < 2 * b @ s - s @ matrix @ s <= b @ best + 1e-12
     s, _ = conjugate_gradients(lambda s: 0 * s, jnp.asarray(b))
     np.testing.assert_array_equal(s, 0)  # nothing is seen: nothing moves
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+@pytest.mark.parametrize("sigma", [None, 0.01])
+def test_errors_of_many_unknowns_are_those_of_few(rho, sigma, without_a_jacobian):
+    noise = lfilter([1], [1, -rho], np.random.default_rng(4).normal(size=(260, 6)), axis=0)[-60:]
+    y, x = np.asarray(residual(TRUTH, 0.0)) + 0.01 * noise, {"a": np.ones(6), "k": np.ones(6)}
+    few = jeuler.fit(residual, x, data=y, sigma=sigma)
+    without_a_jacobian(most_errors=12)
+    many = jeuler.fit(residual, x, data=y, sigma=sigma)
+    without_a_jacobian()
+    asked = jeuler.fit(residual, x, data=y, sigma=sigma)
+    for name in TRUTH:
+        np.testing.assert_allclose(many.stderr_white[name], few.stderr_white[name], rtol=1e-3)
+        np.testing.assert_allclose(many.stderr[name], few.stderr[name], rtol=0.15)
+
+    def ratio(p):
+        return p["a"][0] / p["k"][0]
+
+    assert many.standard_error(ratio) == pytest.approx(few.standard_error(ratio), rel=0.15)
+    assert asked.standard_error(ratio) == pytest.approx(few.standard_error(ratio), rel=0.3)
+    np.testing.assert_allclose(many.autocorrelation, few.autocorrelation, atol=0.1)
+
+
+def test_what_many_data_do_not_determine_is_named(without_a_jacobian):
+    without_a_jacobian(most_errors=3)
+    x = np.linspace(0.0, 1.0, 30)
+    noise = 0.01 * np.random.default_rng(0).normal(size=30)
+    found = jeuler.fit(
+        lambda p, y: p["a"] * p["b"] * x + p["c"] - y,
+        {"a": 1.0, "b": 2.0, "c": 0.0},
+        data=3 * x + noise,
+        bounds={"a": (0.0, None), "b": (0.0, None)},
+    )
+    assert found.blind == ("a and b only as their product",)
+    assert found.standard_error("a") == np.inf
+    assert 0 < found.standard_error(lambda p: p["a"] * p["b"]) < 0.02
+    assert 0 < float(found.stderr["c"]) < 0.01
+    without_a_jacobian()
+    asked = jeuler.fit(lambda p, y: p["a"] * x - y + 0 * p["b"], {"a": 1.0, "b": 2.0}, data=3 * x + noise)
+    assert asked.standard_error("b") == np.inf
+    assert 0 < asked.standard_error("a") < 0.01
+
+
+def test_the_best_of_several_starts_is_kept(without_a_jacobian):
+    without_a_jacobian()
+    t = np.linspace(0.0, 10.0, 101)
+
+    def swing(p, y):
+        return jnp.cos(p["w"] * t) - y
+
+    far = {"w": 9.0}
+    assert not jeuler.fit(swing, far, data=np.cos(2 * t)).explained
+    found = jeuler.fit(swing, far, data=np.cos(2 * t), positive=True, starts=24)
+    np.testing.assert_allclose(found.params["w"], 2.0, rtol=1e-6)
+    assert found.starts["loss"].shape == (24,)
+
+
+def test_what_is_asked_for_in_vain_is_said(without_a_jacobian):
+    found = jeuler.fit(residual, {"a": np.ones(6), "k": np.ones(6)}, data=data())
+    for of, words in (("b", "of must name"), (lambda p: p["a"], "one number"), (3, "of must be")):
+        with pytest.raises(ValueError, match=words):
+            found.standard_error(of)
+    with pytest.raises(ValueError, match="of must have a finite derivative"):
+        found.standard_error(lambda p: jnp.sqrt(p["a"][0] - p["a"][0]))
+    without_a_jacobian()
+    with pytest.raises(ValueError, match="fit again"):
+        copy.copy(jeuler.fit(residual, {"a": np.ones(6), "k": np.ones(6)}, data=data())).standard_error("a[0]")

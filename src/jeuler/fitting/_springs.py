@@ -10,6 +10,7 @@ from typing import Any
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
+from jeuler.fitting.asked import ASKED
 from jeuler.fitting.beside import attach, attached
 from jeuler.fitting.held_out import judged, recordings_without
 from jeuler.fitting.measured.readings import SENSOR_PARAMETERS
@@ -257,7 +258,7 @@ def fit_springs(
         start=begun,
         **fields,
     )
-    for name in (AGAIN, DENSITY):
+    for name in (AGAIN, ASKED, DENSITY):
         attach(complete, name, attached(found.fit, name))
     attach(complete, RECORDING, task)
     return complete

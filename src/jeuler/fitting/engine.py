@@ -44,7 +44,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
     if not problem.small and options.optimizer is None:
         from jeuler.fitting.matrix_free import run_matrix_free
 
-        return Outcome(run_matrix_free(problem, options, known), None)
+        return Outcome(*run_matrix_free(problem, options, evaluate, known))
     record = None
     if options.resume is not None:
         record = Record.of(options.resume, task, problem.stages, x, repr(problem.layout.shapes), options.loss)

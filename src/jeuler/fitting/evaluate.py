@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -15,6 +17,7 @@ from jax import Array, lax
 from jeuler._jax.haste import Haste, jit_in_haste
 
 COLUMNS_AT_ONCE = 16
+SEVERAL = 4  # blocks that are worth threads
 
 Residual = Callable[[Array, Any], Array]
 Pair = tuple[Any, Callable[[], Any]]
@@ -88,9 +91,18 @@ def by_blocks(program: Callable[[Any, Any, np.ndarray], tuple[Any, Any]], x: np.
     def jacobian() -> np.ndarray:
         rows = np.empty((n, len(r)))
         rows[: len(first)] = first
-        for start in range(len(first), n, COLUMNS_AT_ONCE):
+
+        def block(start: int) -> None:
             more = np.asarray(program(x, data, directions_of(start, n))[1])
             rows[start : start + len(more)] = more[: n - start]
+
+        starts = range(len(first), n, COLUMNS_AT_ONCE)
+        if len(starts) < SEVERAL:
+            for start in starts:
+                block(start)
+        else:  # a run of small arrays keeps one core busy
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                list(pool.map(block, starts))
         return rows.T
 
     return r, jacobian

@@ -8,7 +8,6 @@ optimistix's Levenberg-Marquardt has no bounds, nor a scale for each unknown, wi
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -17,16 +16,29 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jeuler._core.partition import OfArrays
+from jeuler.fitting.asked import ASKED, Asked, quick_to_compile
+from jeuler.fitting.beside import attach
+from jeuler.fitting.evaluate import Evaluate
 from jeuler.fitting.kept import Record
-from jeuler.fitting.least_squares import CONVERGED, NOT_FINITE, RUNNING, STALLED, Task, start
+from jeuler.fitting.least_squares import (
+    CONVERGED,
+    NOT_FINITE,
+    RUNNING,
+    STALLED,
+    State,
+    Task,
+    column_norms,
+    start,
+)
 from jeuler.fitting.losses import LOSSES
+from jeuler.fitting.many import MOST_BYTES, MOST_ERRORS, weighted_jacobian
 from jeuler.fitting.minimise import TUNING, Watch, progress_bar
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import FlatResidual, Problem
 from jeuler.fitting.report import NOT_FINITE as WITHOUT_A_START
 from jeuler.fitting.report import ending, report
 from jeuler.fitting.result import Fit
+from jeuler.fitting.starts import best_of, starts_of
 
 PROBES = 8  # random directions that estimate the norms of the columns
 MOST_PRODUCTS = 300  # iterations of conjugate gradients in one step
@@ -53,16 +65,6 @@ class Products(NamedTuple):
 
     cost: Any
     step: Any
-
-
-def quick_to_compile(residual: FlatResidual) -> FlatResidual:
-    """The residual with its steps written in loops, where it has such a form of itself, ``in_loops``."""
-    function: Any = residual.residual
-    if isinstance(function, OfArrays) and hasattr(function.function, "in_loops"):
-        function = dataclasses.replace(function, function=function.function.in_loops())
-    elif hasattr(function, "in_loops"):
-        function = function.in_loops()
-    return dataclasses.replace(residual, residual=function)
 
 
 @functools.lru_cache(maxsize=8)
@@ -132,12 +134,11 @@ def conjugate_gradients(product: Any, b: Array) -> tuple[Array, Array]:
     return s, left
 
 
-def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
-    """The fit of a problem whose Jacobian is not formed; standard errors are not computed."""
-    if options.starts is not None:
-        raise ValueError(
-            f"starts must be None for {len(problem.x)} unknowns, got {options.starts!r}; start at one place"
-        )
+def run_matrix_free(problem: Problem, options: Options, evaluate: Evaluate, known: Known) -> tuple[Fit, State | None]:
+    """The fit of a problem whose Jacobian the search does not form, and where it ended.
+
+    The Jacobian is formed once at the end, for the errors, where it is not too large; else the state is None.
+    """
     task = problem.task(options.tolerance)
     spread = options.loss_scale if options.loss_scale is not None else TUNING * (known.noise or 1.0)
     task = task._replace(spread=np.asarray(spread if options.loss != "linear" else 1.0))
@@ -147,8 +148,17 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
     kept = None if record is None else record.load(Point)
     first, point, history = (0, beginning(x, problem.form.size), []) if kept is None else kept
     with progress_bar(options.progress, options.max_iterations) as bar:
-        watch = Watch(bar, record)
-        for stage, mask in enumerate((*problem.stages, task.all_weights)):
+        watch, starts, stages = Watch(bar, record), None, problem.stages
+        if options.starts is not None and kept is None:
+            xs = starts_of(problem.layout, options, x, task, lambda: np.where(x != 0, np.abs(x), 1.0))
+            alone = Watch(bar)
+            ends = [
+                descend(products, beginning(one, problem.form.size), task, options.max_iterations, 0, [], alone)
+                for one in xs
+            ]
+            x, starts = best_of(problem, ends)
+            point, stages = beginning(x, problem.form.size), ()
+        for stage, mask in enumerate((*stages, task.all_weights)):
             if stage < first or watch.interrupted:
                 continue
             if stage > first or kept is None:
@@ -156,11 +166,36 @@ def run_matrix_free(problem: Problem, options: Options, known: Known) -> Fit:
             point = descend(products, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
     if not np.isfinite(point.total):
         raise ValueError(WITHOUT_A_START)
-    state = start(point.x, 0, 1)
+    state, words = start(point.x, 0, 1), ending(point, watch)
     state = state._replace(**{name: getattr(point, name) for name in ("total", "residual", "nonfinite", "status")})
-    more = (*known.more, f"standard errors are not computed for {len(x)} unknowns")
-    told = Known(known.variance, known.noise, more)
-    return report(problem, state, history, 1.0, options.loss, ending(state, watch), told)
+    bend = float(task.spread)
+    if (formed := _with_jacobian(problem, evaluate, state, task, options.loss)) is not None:
+        return report(problem, formed, history, bend, options.loss, words, known, starts), formed
+    more = (
+        *known.more,
+        f"standard errors are not computed for {len(x)} unknowns: .standard_error(name) gives those that you ask for",
+    )
+    fit = report(problem, state, history, bend, options.loss, words, Known(known.variance, known.noise, more), starts)
+    if not watch.interrupted:
+        attach(fit, ASKED, Asked(problem, options.loss, state, task))
+    return fit, None
+
+
+def _with_jacobian(problem: Problem, evaluate: Evaluate, state: State, task: Task, loss: str) -> State | None:
+    """The state with its Jacobian; None where that is too large, not finite, or the user stops it."""
+    n, m = len(state.x), problem.form.size
+    if n > MOST_ERRORS or 8 * m * n > MOST_BYTES:
+        return None
+    try:
+        jacobian = weighted_jacobian(evaluate, state.x, task.data, np.asarray(task.all_weights, float))
+    except KeyboardInterrupt:
+        return None
+    if not np.isfinite(np.sum(jacobian)):
+        return None
+    _, slope = LOSSES[loss](state.residual / task.spread)
+    if loss != "linear":
+        jacobian *= slope[:, None]
+    return state._replace(jacobian=jacobian, scale=column_norms(jacobian))
 
 
 def beginning(x: np.ndarray, m: int, nonfinite: Any = 0) -> Point:

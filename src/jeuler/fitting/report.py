@@ -7,25 +7,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jeuler.fitting import least_squares
+from jeuler.fitting.beside import attach
 from jeuler.fitting.blind import describe_blind
 from jeuler.fitting.factors import namespace
 from jeuler.fitting.least_squares import State
 from jeuler.fitting.losses import LOSSES
+from jeuler.fitting.many import uncertainty_of_many
 from jeuler.fitting.minimise import Watch
 from jeuler.fitting.options import Known
-from jeuler.fitting.problem import Problem, series_of
+from jeuler.fitting.problem import MOST_COLUMNS, Problem, series_of
 from jeuler.fitting.result import Fit, Verdict
 from jeuler.fitting.uncertainty import Uncertainty, uncertainty
 from jeuler.fitting.unknowns import Layout, readable
 
+INVERSE = "inverse"  # under this name that of J^T J is kept beside a result of many unknowns
 NOT_FINITE = (
     "the residual is not finite at the start of the fit, nor at any point that was tried; "
     "start closer, or use a smaller dt or a stabler step"
 )
 
 
-def ending(state: State, watch: Watch | None = None) -> str:
-    """How a search ended, in words."""
+def ending(state: Any, watch: Watch | None = None) -> str:
+    """How a search ended, in words, from its state."""
     if watch is not None and watch.interrupted:
         return "interrupted: the best so far"
     if state.status in (least_squares.CONVERGED, least_squares.ROUNDED):
@@ -73,7 +76,7 @@ def report(
         more=(*apart, *known.more, *_few(size, len(x)), *_kept(layout)),
         **quality,
     )
-    return Fit(
+    fit = Fit(
         params=layout.params(x),
         loss=total / size,
         history=np.asarray(history) / size,
@@ -90,6 +93,8 @@ def report(
         starts=starts,
         **quality,
     )
+    attach(fit, INVERSE, errors.inverse)
+    return fit
 
 
 class _Errors(NamedTuple):
@@ -103,6 +108,7 @@ class _Errors(NamedTuple):
     unresolved: tuple[str, ...] = ()  # positive parameters whose error is larger than their value
     autocorrelation: float | None = None
     correlated: bool = False
+    inverse: Any = None  # of J^T J
 
 
 def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors:
@@ -126,6 +132,7 @@ def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors
         unresolved=tuple(np.asarray(layout.names(readable))[doubtful]),
         autocorrelation=float(found.autocorrelation) if np.isfinite(found.autocorrelation) else None,
         correlated=bool(np.any(found.covariance != found.white)),
+        inverse=found.inverse,
     )
 
 
@@ -154,4 +161,6 @@ def errors_of(problem: Problem, state: State, spread: Any, loss: str) -> Uncerta
     series, fixed = series_of(problem.form), 0
     if problem.residual.priors is not None:  # the last rows
         series, fixed = series[:-1], len(problem.residual.priors.places)
+    if xp is np and len(state.x) > MOST_COLUMNS:
+        return uncertainty_of_many(jacobian, influence, curvature, counted, series, absolute, fixed)
     return uncertainty(jacobian, influence, curvature, counted, series, problem.precision, absolute, fixed)

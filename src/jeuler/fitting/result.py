@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ from jax import Array
 from jeuler._core.component import result
 from jeuler.fitting._tables import fit_table
 from jeuler.fitting.beside import attached
+from jeuler.fitting.errors import error_of
 from jeuler.fitting.profiles import AGAIN, Profile
 
 PyTree = Any
@@ -27,7 +29,8 @@ class Fit:
       loss: the mean square of the residual there, each as it counts: over sigma, times the root of its weight.
       history: the loss after each iteration, over all the data, (iteration,).
       stderr: standard error of each parameter, of the structure of params, for noise that is correlated as the
-        residual is; inf where the data do not determine it. None where the Jacobian would not fit in a gigabyte.
+        residual is; inf where the data do not determine it. None for more than 3,000 unknowns, or where the Jacobian
+        would not fit in half a gigabyte: `standard_error` gives those that you ask for.
       stderr_white: the same for independent noise: the smaller of the two on most recordings.
       covariance: of the parameters in the order of ``jax.flatten_util.ravel_pytree(params)``, (n, n), or None; within
         what the data determine, so that the error of a ratio or a sum is right even where its parts have none.
@@ -129,6 +132,31 @@ class Fit:
                 "unknowns; a copy, and what comes out of jit or vmap, has none; fit again"
             )
         return density(params)
+
+    def standard_error(self, of: str | Callable[[PyTree], Any]) -> float:
+        """The standard error of one number: of a parameter, or of what is computed from several.
+
+            sqrt(c^T C c),   c = d of / d params,   C the covariance
+
+        Where a fit has so many unknowns that it has no covariance, one linear problem with the Jacobian is solved for
+        it, by conjugate gradients; of the errors for correlated and for white noise it is then the larger.
+
+        Args:
+          of: the name of a parameter, "k" or "ks[3]", or a function of the params, differentiable, such as
+            ``lambda p: p["ks"][0] / p["mass"]``.
+        Returns: the error; inf where the data do not determine it.
+        Raises: ValueError, if there is no such parameter, the function does not give one number, or the fit was
+          copied or traced.
+        Example:
+          >>> import jax.numpy as jnp, jeuler
+          >>> x = jnp.linspace(0.0, 1.0, 11)
+          >>> line = lambda p: p["a"] + p["b"] * x - 3 * x - 0.1 * jnp.sin(40 * x)
+          >>> found = jeuler.fit(line, {"a": 1.0, "b": 1.0})
+          >>> middle = found.standard_error(lambda p: p["a"] + p["b"] / 2)
+          >>> middle < found.standard_error("a") and found.standard_error("a") == float(found.stderr["a"])
+          True
+        """
+        return error_of(self, of)
 
     @property
     def correlation(self) -> Any:

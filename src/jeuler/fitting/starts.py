@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,21 +18,22 @@ from jeuler.fitting.minimise import Watch
 from jeuler.fitting.options import Options
 from jeuler.fitting.problem import JACOBIAN_BYTES, Problem
 from jeuler.fitting.report import NOT_FINITE
+from jeuler.fitting.unknowns import Layout
 
 
 def best_start(
     problem: Problem, options: Options, evaluate: Evaluate, task: Task, x: np.ndarray, watch: Watch
 ) -> tuple[np.ndarray, dict[str, Any]]:
     """Where the best of many short searches ended, and all of them."""
-    layout, n, m = problem.layout, len(x), problem.form.size
-    if isinstance(options.starts, (int, np.integer)) and not isinstance(options.starts, bool):
-        xs = drawn_starts(checks.count("starts", options.starts, least=1), x, task, evaluate)
-    else:
-        count = _count_of(options.starts, layout)
-        xs = np.stack(
-            [np.asarray(layout.vector(jax.tree.map(lambda a, k=k: a[k], options.starts)), float) for k in range(count)]
-        )
-        xs = np.clip(xs, task.lower, task.upper)
+    n, m = len(x), problem.form.size
+
+    def reach() -> Any:
+        with np.errstate(all="ignore"):
+            r, jacobian = evaluate.both(jnp.asarray(x), task.data)
+            norms = np.asarray(least_squares.column_norms(np.asarray(jacobian, float)))
+            return np.linalg.norm(np.asarray(r, float)) / norms
+
+    xs = starts_of(problem.layout, options, x, task, reach)
     at_once = max(1, min(len(xs), JACOBIAN_BYTES // 4 // (8 * m * n)))
     states = many_starts(
         evaluate.both,
@@ -43,15 +44,29 @@ def best_start(
         watch=watch,
         at_once=at_once,
     )
-    size = max(int(np.sum(task.all_weights > 0)), 1)
+    return best_of(problem, states)
+
+
+def starts_of(layout: Layout, options: Options, x: np.ndarray, task: Task, reach: Callable[[], Any]) -> np.ndarray:
+    """The starts that were asked for, (start, n), within the bounds."""
+    if isinstance(options.starts, (int, np.integer)) and not isinstance(options.starts, bool):
+        return drawn_starts(checks.count("starts", options.starts, least=1), x, task, reach())
+    count = _count_of(options.starts, layout)
+    xs = [np.asarray(layout.vector(jax.tree.map(lambda a, k=k: a[k], options.starts)), float) for k in range(count)]
+    return np.asarray(np.clip(np.stack(xs), task.lower, task.upper))
+
+
+def best_of(problem: Problem, states: Sequence[Any]) -> tuple[np.ndarray, dict[str, Any]]:
+    """Where the best of some searches ended, and all of them."""
+    size = max(int(np.sum(np.asarray(problem.weights) > 0)), 1)
     losses = np.array([state.total / size for state in states])
     if not np.isfinite(losses).any():
         raise ValueError(NOT_FINITE)
-    every = jax.tree.map(lambda *a: jnp.stack(a), *[layout.params(jnp.asarray(s.x)) for s in states])
+    every = jax.tree.map(lambda *a: jnp.stack(a), *[problem.layout.params(jnp.asarray(s.x)) for s in states])
     return states[int(np.nanargmin(losses))].x, {"params": every, "loss": losses}
 
 
-def _count_of(starts: Any, layout: Any) -> int:
+def _count_of(starts: Any, layout: Layout) -> int:
     """How many starts a tree of them holds, or one ValueError."""
     leaves, structure = jax.tree.flatten(starts)
     shapes = [np.shape(leaf) for leaf in leaves]
@@ -64,13 +79,9 @@ def _count_of(starts: Any, layout: Any) -> int:
     return int(min(counts))
 
 
-def drawn_starts(count: int, x: np.ndarray, task: Task, evaluate: Any) -> np.ndarray:
+def drawn_starts(count: int, x: np.ndarray, task: Task, reach: np.ndarray) -> np.ndarray:
     """Starts about the given one, which is the first: within bounds, a factor of ten, or what changes the residual."""
     draw = np.random.default_rng(0)
-    with np.errstate(all="ignore"):
-        r, jacobian = evaluate.both(x, task.data)
-        norms = np.asarray(least_squares.column_norms(np.asarray(jacobian, float)))
-        reach = float(np.linalg.norm(np.asarray(r, float))) / norms
     reach = np.where(np.isfinite(reach) & (reach > 0), reach, np.where(x != 0, np.abs(x), 1.0))
     between = np.isfinite(task.lower) & np.isfinite(task.upper)
     low, high = np.where(between, task.lower, 0), np.where(between, task.upper, 0)

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jeuler.fitting import least_squares
+from jeuler.fitting.beside import attached
 from jeuler.fitting.factors import projected
 from jeuler.fitting.forward import Forward
 from jeuler.fitting.least_squares import State
 from jeuler.fitting.prediction import recording
+from jeuler.fitting.report import INVERSE
 from jeuler.fitting.result import Fit
 from jeuler.fitting.unknowns import Layout, readable
 
@@ -48,7 +50,7 @@ def shifted(
     jump = 2**order / (2**order - 1)
     change = np.zeros(len(state.residual))  # that of the rows of priors is 0
     change[: len(whole)] = (half - whole) * jump * weights
-    shift = _shift(state, change)
+    shift = _shift(state, change, attached(found, INVERSE))
     error = np.asarray(layout.vector(found.stderr), float)
     share = np.where(np.isfinite(error) & (error > 0), np.abs(shift) / np.where(error > 0, error, 1), 0)
     bias = layout.params(shift)
@@ -75,8 +77,10 @@ def _residuals(task: Recorded, layout: Layout, found: Fit) -> tuple[np.ndarray, 
     return forward.residual_at(x, task.data)[0], forward.residual_at(x, halved, parts=2)[0]
 
 
-def _shift(state: State, change: np.ndarray) -> np.ndarray:
-    """J^+ of a change of the weighted residual."""
+def _shift(state: State, change: np.ndarray, inverse: np.ndarray | None) -> np.ndarray:
+    """-J^+ of a change of the weighted residual."""
+    if inverse is not None:
+        return np.asarray(-inverse @ (state.jacobian.T @ change))
     scale = np.where(state.scale > 0, state.scale, 1)
     q, triangle = projected(state.jacobian / scale, change[:, None])
     return -least_squares.damped_solution(triangle, q[:, 0], np.asarray(0.0)) / scale

@@ -31,7 +31,7 @@ class Directions(NamedTuple):
       values: singular values, (k,).
       vectors: right singular vectors, (n, k).
       seen: which of them change the residual beyond rounding, (k,).
-      left: the left singular vectors, (m, k).
+      left: the left singular vectors, (m, k); None where they were not computed.
     """
 
     norms: Any
@@ -42,6 +42,8 @@ class Directions(NamedTuple):
 
     def null(self) -> np.ndarray:
         """Directions of the parameters that change nothing, (n, k)."""
+        if self.seen.all() and len(self.seen) == len(self.norms):
+            return np.zeros((len(self.norms), 0))
         vectors = self.vectors[:, self.seen]
         _, _, vt = np.linalg.svd(vectors.T, full_matrices=True)
         return vt[vectors.shape[1] :].T / self.norms[:, None]
@@ -57,6 +59,7 @@ class Uncertainty(NamedTuple):
       autocorrelation: of the residual at lag one, corrected for the fit, ().
       variance: of the weighted noise, ().
       directions: of the Jacobian.
+      inverse: of J^T J, where that was computed, (n, n).
     """
 
     covariance: Any
@@ -65,6 +68,7 @@ class Uncertainty(NamedTuple):
     autocorrelation: Any
     variance: Any
     directions: Directions
+    inverse: Any = None
 
 
 def directions(jacobian: Any, precision: float) -> Directions:
@@ -125,7 +129,7 @@ def uncertainty(
     white = half @ shape @ (basis.T @ basis) @ shape @ half.T * size
     noise = autoregression(gamma, xp.sum(counted), xp)
     if xp is np and noise.order == 0:
-        return _result(white, white, gamma, enough, d, n, absolute, variance, xp)
+        return with_covariances(white, white, gamma, enough, d, n, absolute, variance, xp)
     unit = 1 / xp.where(gamma[0] > 0, gamma[0], 1) if absolute else 1.0
     meat = unit * _through(basis[some], noise, series, xp) + basis[m - fixed :].T @ basis[m - fixed :]
     correlated = half @ shape @ meat @ shape @ half.T
@@ -137,10 +141,10 @@ def uncertainty(
     correlated = correlated * wider[:, None] * wider[None, :]
     use = xp.all(xp.isfinite(correlated)) & enough & (noise.order > 0)
     correlated = xp.where(use, correlated, white)
-    return _result(correlated, white, gamma, enough, d, n, absolute, variance, xp)
+    return with_covariances(correlated, white, gamma, enough, d, n, absolute, variance, xp)
 
 
-def _result(
+def with_covariances(
     correlated: Any, white: Any, gamma: Any, enough: Any, d: Directions, n: int, absolute: bool, variance: Any, xp: Any
 ) -> Uncertainty:
     """The two covariances, what is blind, and the correlation from one sample to the next."""
@@ -176,7 +180,7 @@ def _lags(series: Series, n: int, m: int) -> int:
     return max(0, min(most, (m - n - 2) // 5, longest // 5))
 
 
-def _parts(x: Any, series: Series) -> list[Any]:
+def parts_of(x: Any, series: Series) -> list[Any]:
     """A vector (m, ...) as its series, each (time, channel, ...)."""
     parts, start = [], 0
     for times, channels in series:
@@ -185,7 +189,7 @@ def _parts(x: Any, series: Series) -> list[Any]:
     return parts
 
 
-def _both_sides(x: Any, lag: int, xp: Any) -> Any:
+def both_sides(x: Any, lag: int, xp: Any) -> Any:
     """The sum of x ``lag`` samples later and earlier, 0 beyond the ends, along the first axis."""
     if lag == 0:
         return x
@@ -200,16 +204,16 @@ def autocovariances(residual: Any, counted: Any, basis: Any, series: Series, lag
 
     E[r^T U_h r] = sum_j gamma_j tr(U_h M V_j M), solved for gamma; U and V shift by h and j samples.
     """
-    kept, mask = _parts(xp.where(counted, residual, 0), series), _parts(xp.where(counted, 1.0, 0.0), series)
+    kept, mask = parts_of(xp.where(counted, residual, 0), series), parts_of(xp.where(counted, 1.0, 0.0), series)
     if basis.shape[0] > 50 * basis.shape[1] and basis.size > LARGE // 4:  # then a factor will do
-        plain = [_inner(kept, [_both_sides(r, h, xp) for r in kept], xp) / (2 if h else 1) for h in range(lags + 1)]
-        pairs = [_inner(mask, [_both_sides(r, h, xp) for r in mask], xp) / (2 if h else 1) for h in range(lags + 1)]
+        plain = [_inner(kept, [both_sides(r, h, xp) for r in kept], xp) / (2 if h else 1) for h in range(lags + 1)]
+        pairs = [_inner(mask, [both_sides(r, h, xp) for r in mask], xp) / (2 if h else 1) for h in range(lags + 1)]
         return xp.stack([xp.asarray(a) for a in plain]) / (xp.stack([xp.asarray(a) for a in pairs]) - basis.shape[1])
-    shifted = [_parts(basis, series)]
-    shifted += [[_both_sides(q, h, xp) for q in shifted[0]] for h in range(1, lags + 1)]
+    shifted = [parts_of(basis, series)]
+    shifted += [[both_sides(q, h, xp) for q in shifted[0]] for h in range(1, lags + 1)]
     half = [1.0, *[0.5] * lags]
-    seen = [half[h] * _inner(kept, [_both_sides(r, h, xp) for r in kept], xp) for h in range(lags + 1)]
-    pairs = [half[h] * _inner(mask, [_both_sides(r, h, xp) for r in mask], xp) for h in range(lags + 1)]
+    seen = [half[h] * _inner(kept, [both_sides(r, h, xp) for r in kept], xp) for h in range(lags + 1)]
+    pairs = [half[h] * _inner(mask, [both_sides(r, h, xp) for r in mask], xp) for h in range(lags + 1)]
     flat = basis.shape[1]
     within = [
         sum(a.reshape(-1, flat).T @ b.reshape(-1, flat) for a, b in zip(shifted[0], y, strict=True)) for y in shifted
@@ -288,7 +292,7 @@ def _through(basis: Any, noise: Noise, series: Series, xp: Any) -> Any:
         share, _ = noise.spectrum(4096, xp)
         return xp.max(share[1:-1]) * 2048 * (basis.T @ basis)
     total = 0.0
-    for q in _parts(basis, series):
+    for q in parts_of(basis, series):
         share, _ = noise.spectrum(_length(len(q)), xp)
         for channel in range(q.shape[1]):
             transformed = xp.fft.rfft(q[:, channel], n=_length(len(q)), axis=0)
@@ -302,7 +306,7 @@ def _sensitivity(influence: Any, known: Any, n: int, noise: Noise, series: Serie
     if influence is None:
         return xp.zeros((n, len(noise.coefficients))), xp.ones(n)
     variance, slope = known, 0.0
-    for g in _parts(influence, series):
+    for g in parts_of(influence, series):
         share, by_phi = noise.spectrum(_length(len(g)), xp)
         power = sum(xp.abs(xp.fft.rfft(g[:, c], n=_length(len(g)), axis=0)) ** 2 for c in range(g.shape[1]))
         variance = variance + share @ power

@@ -1,0 +1,67 @@
+"""The error of one number that a fit determines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jeuler._core import checks
+from jeuler.fitting.asked import ASKED
+from jeuler.fitting.beside import attached
+from jeuler.fitting.unknowns import Layout, readable
+
+UNSEEN = 1e-10  # share of the largest eigenvalue of the correlations below which one is rounding
+
+
+def error_of(found: Any, of: str | Callable[[Any], Any]) -> float:
+    """The standard error of a parameter by name, or of a function of the params; see `Fit.standard_error`."""
+    layout = Layout.of(found.params)
+    asked = attached(found, ASKED)
+    if any(map(checks.is_traced, jax.tree.leaves(found.params))) or (found.covariance is None and asked is None):
+        raise ValueError("standard_error needs the fit as `fit` gave it, with values, uninterrupted; fit again")
+    direction = _of_name(layout, of) if isinstance(of, str) else _of_function(layout, found.params, of)
+    if found.covariance is None:
+        return float(asked.standard_error(direction))
+    error = np.asarray(layout.vector(found.stderr), float)
+    if isinstance(of, str):
+        return float(error[np.argmax(direction)])
+    return _through(np.asarray(found.covariance, float), direction, np.isfinite(error))
+
+
+def _of_name(layout: Layout, name: str) -> np.ndarray:
+    names, plain = layout.names(readable), layout.names()
+    if name not in names and name not in plain:
+        some = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
+        raise ValueError(f"of must name a parameter, one of {some}, or be a function of the params, got {name!r}")
+    return np.eye(1, len(names), (names if name in names else plain).index(name))[0]
+
+
+def _of_function(layout: Layout, params: Any, of: Any) -> np.ndarray:
+    checks.function("of", of, "(params) -> number", 'write of=lambda p: p["ks"][0] / p["mass"], or the name of one')
+    x = jnp.asarray(layout.vector(params))
+    shape = getattr(jax.eval_shape(lambda x: of(layout.params(x)), x), "shape", None)
+    if shape != ():
+        raise ValueError(f"of must return one number, got {'a tree' if shape is None else f'shape {shape}'}")
+    slope = np.asarray(jax.grad(lambda x: jnp.asarray(of(layout.params(x)), x.dtype))(x), float)
+    if not np.isfinite(slope).all():
+        raise ValueError("of must have a finite derivative at the fitted params, got one that is not finite")
+    return slope
+
+
+def _through(covariance: np.ndarray, direction: np.ndarray, known: np.ndarray) -> float:
+    """sqrt(c^T C c); inf where c has a part of what the data do not determine."""
+    variance = np.diag(covariance)
+    size = np.sqrt(np.where(variance > 0, variance, 1))
+    if not known.all():
+        if np.any(direction[~known & (variance <= 0)]):
+            return float(np.inf)
+        c = direction * size
+        values, vectors = np.linalg.eigh(covariance / size / size[:, None])
+        unseen = vectors[:, values <= UNSEEN * values.max(initial=0)]
+        if np.linalg.norm(unseen.T @ c) > 1e-5 * np.linalg.norm(c):
+            return float(np.inf)
+    return float(np.sqrt(max(float(direction @ covariance @ direction), 0.0)))
