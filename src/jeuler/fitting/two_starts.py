@@ -19,7 +19,10 @@ def from_both(
     """Search from the data and, where that is not good, from the given values; the better, and its start."""
     if begun is None:
         return run(given, options, scale=scale, known=known), "given"
-    best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
+    try:
+        best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
+    except ValueError:  # not finite there, as where a sensor's gain is not that of its start
+        return run(given, options, scale=scale, known=known), "given"
     if is_good(best.fit) or options.optimizer is not None:
         return best, "data"
     try:
