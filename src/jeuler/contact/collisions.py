@@ -86,7 +86,7 @@ class Collisions:
             checks.finite(f"Collisions.{name}", getattr(self, name))
 
     @previous_is_optional
-    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any, *, solved: bool = False) -> Any:
+    def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any, *, acceleration: Any = None) -> Any:
         if not self.colliders and not self.pairs:
             return state
         if previous is None:
@@ -94,7 +94,7 @@ class Collisions:
         x, v = previous.position, previous.velocity
         contacts = Contacts(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
         position, velocity, unresolved = resolve(
-            contacts, x, v, state.position, state.velocity, self._rounds(), solved=solved
+            contacts, x, v, state.position, state.velocity, self._rounds(), acceleration=acceleration
         )
         before = state.unresolved_contacts
         count = before if before is None else before + unresolved

@@ -116,16 +116,17 @@ class Problem(NamedTuple):
         return jnp.concatenate([unmoved, jnp.where(on, left + overlap, q)[:, None]], axis=1)
 
 
-def at_rest(problem: Problem, small: Array, *, solved: bool = False) -> Rest:
+def at_rest(problem: Problem, small: Array, loaded: Problem | None = None) -> Rest:
     """The answer of the contacts that are active. Overlaps of ``small``, (contact,), m, are none.
 
-    ``solved``: the velocities may hold this answer already, so that what touches at both ends of the step presses.
+    Where its velocities may hold this answer already, ``loaded`` is the problem with those that do not: what presses
+    there, and touches at both ends of the step, acts.
     """
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
-        stays = jnp.abs(problem.gap) <= small + problem.weak() if solved else False
+        stays = False if loaded is None else (jnp.abs(problem.gap) <= small + problem.weak()) & pressing(loaded, small)
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
     if len(contacts.colliders) == 1 and not len(contacts.i):  # each particle for itself: exact at once
@@ -149,6 +150,14 @@ def at_rest(problem: Problem, small: Array, *, solved: bool = False) -> Rest:
     shift = contacts.move(q[:, None] * problem.normal)
     left = jnp.where(active, contacts.dt * left, 0)
     return Rest(contacts.move(w), contacts.dt * shift, on, left, unresolved)
+
+
+def pressing(problem: Problem, small: Array) -> Array:
+    """Which contacts, (contact,), push in the answer; overlaps of ``small``, over dt, m/s, are none. No derivative."""
+    if len(problem.contacts.colliders) == 1 and not len(problem.contacts.i):
+        return problem.push(problem.project(-problem.velocity)) > problem.weak()
+    rate = 1 / problem.contacts.both(jnp.maximum, _number_of_contacts(problem.contacts, problem.close()))
+    return problem.push(_iterate(lax.stop_gradient(problem), rate, small)[0][:, :-1]) > problem.weak()
 
 
 def together(problem: Problem, small: Array) -> tuple[Array, Array]:

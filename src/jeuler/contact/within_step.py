@@ -27,27 +27,35 @@ def _kept(primitive: Any, *_: Any, name: str = "", label: str = "", **__: Any) -
     return name in (IMPACTS, REST) or label == REST or primitive is found_p
 
 
-@functools.partial(jax.jit, static_argnames=("rounds", "solved"))
+@functools.partial(jax.jit, static_argnames="rounds")
 def resolve(
-    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, *, solved: bool = False
+    contacts: Contacts,
+    x: Array,
+    v: Array,
+    x_free: Array,
+    v_free: Array,
+    rounds: int,
+    acceleration: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """Position and velocity at the end of a step that led from (x, v) to (x_free, v_free), and what it left undone.
 
-    ``solved``: the step may have solved for its end with the forces of what rests.
+    A step that may have solved for its end with the forces of what rests says the acceleration, (particle, dim), at its
+    start without them: by it is known what presses.
     """
-    step = functools.partial(_resolve, rounds=rounds, solved=solved)
+    load = None if acceleration is None else lax.stop_gradient(v + contacts.dt * acceleration)
+    step = functools.partial(_resolve, rounds=rounds, load=load)
     return jax.checkpoint(step, prevent_cse=False, policy=_kept)(contacts, x, v, x_free, v_free)
 
 
 def _resolve(
-    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, solved: bool
+    contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, load: Array | None
 ) -> tuple[Array, Array, Array]:
     displacement, dv = x_free - x, v_free - v
     theta = share_of_the_force(displacement, v, dv, contacts.dt)
     contacts.near(free_path(x, displacement, dv, contacts.dt))
     slow = _slow(contacts, dv)
 
-    path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, solved)
+    path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, load)
     contacts.lift_off(path)
     impacts = schedule(contacts, *lax.stop_gradient((path, slow, theta)), rounds)
     events, after, left = checkpoint_name(impacts, IMPACTS)
@@ -108,7 +116,14 @@ def _end(path: Path) -> tuple[Array, Array]:
 
 
 def hold(
-    contacts: Contacts, x: Array, v: Array, displacement: Array, dv: Array, theta: Array, slow: Array, solved: bool
+    contacts: Contacts,
+    x: Array,
+    v: Array,
+    displacement: Array,
+    dv: Array,
+    theta: Array,
+    slow: Array,
+    load: Array | None,
 ) -> tuple[Path, Array, Array, Array, Array]:
     """The paths with the forces of what touches at the start and does not bounce, the velocity at their end, who is
     touched by them, the number of contacts that are not resolved, and who has a collider without a distance there."""
@@ -116,7 +131,11 @@ def hold(
     end_speed = contacts.relative(v + dv) + recession[:, None] * normal
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
     problem = Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt)
-    rest = at_rest(problem, small, solved=solved)
+    if load is None:
+        rest = at_rest(problem, small)
+    else:
+        speed = contacts.relative(load) + recession[:, None] * normal
+        rest = at_rest(problem, small, problem._replace(velocity=speed))
     radius = contacts.both(jnp.add, contacts.radius)
     unclear = stays & (radius > 0) & (small > 0.05 * radius)  # far from the origin nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | unclear).astype(jnp.int32)

@@ -124,7 +124,7 @@ class EffectHooks(Effect, Protocol):
     keyword's default, n the steps taken before this one; "forward time", dt > 0; "prescribed pinned", mass inf of
     prescribed particles as of pinned ones; "the solve", a place in the equation of steps that solve for their end:
     ``answer(t, dt, state, acceleration)``, of the state at the start and the acceleration there, gives a function of
-    the velocities at the end, (particle, dim), to what is added to them, and the call gets ``solved=True``."""
+    the velocities at the end, (particle, dim), to what is added to them, and the call gets ``acceleration=`` too."""
 
     max_births: int | None
     """The most births in a step, None for no limit: windows must hold them."""

@@ -138,10 +138,18 @@ class SceneStep:
                 key = None if self.key is None else jax.random.fold_in(jax.random.fold_in(self.key, number), k)
                 act = with_its_needs(effect, key, n, self.grid.t0)
                 if needs(effect, "the solve") and self.contact_in_the_solve() is not None:
-                    act = functools.partial(act, solved=True)
+                    act = functools.partial(self._with_acceleration, act)
                 if needs(effect, "prescribed pinned") and self.equation.effects:
                     act = functools.partial(self._with_prescribed_pinned, act)
                 yield f"effects[{k}] {name_of(effect)}", act
+
+    def _with_acceleration(
+        self, act: Callable, t: Any, dt: Any, previous: ParticleState, state: ParticleState
+    ) -> ParticleState:
+        """The effect, told what acceleration the forces gave at the start of the step."""
+        motion, attributes = (previous.position, previous.velocity), self.scene.attributes(previous)
+        _, acceleration = self.windowed(len(previous.position)).vector_field(t - dt, motion, attributes)
+        return act(t, dt, previous, state, acceleration=acceleration)
 
     def _with_prescribed_pinned(
         self, act: Callable, t: Any, dt: Any, previous: ParticleState, state: ParticleState
