@@ -218,6 +218,23 @@ def _traced_again(function: Callable, settings: tuple, inputs: tuple, further: t
     return lambda further: compiled(dynamic, further[:1], further[1:])
 
 
+def lowered(function: Callable, inputs: tuple, settings: tuple, *further: Any) -> tuple[Any, list]:
+    """``function(*inputs, *settings, *further)`` before it is compiled, and those inputs that are arrays.
+
+    ``.compile()(arrays, further[:1], further[1:])`` runs it, in the memory of the first of ``further``.
+    """
+    leaves, structure = jax.tree.flatten(inputs, is_leaf=functools.partial(_stands_alone, set()))
+    is_dynamic = [_is_dynamic(leaf) for leaf in leaves]
+
+    def run(dynamic, first, rest):
+        given = iter(dynamic)
+        merged = [next(given) if d else leaf for leaf, d in zip(leaves, is_dynamic, strict=True)]
+        return function(*jax.tree.unflatten(structure, merged), *settings, *first, *rest)
+
+    dynamic = [leaf for leaf, d in zip(leaves, is_dynamic, strict=True) if d]
+    return jax.jit(run, donate_argnums=1).lower(dynamic, further[:1], further[1:]), dynamic
+
+
 def needs_values(error: BaseException | None) -> bool:
     """Whether this error, or what it was raised from, is that something traced was asked for its value."""
     return error is not None and (isinstance(error, NEEDS_VALUES) or needs_values(error.__cause__))

@@ -25,6 +25,7 @@ from jeuler.particles.windows import in_windows
 from jeuler.solving._scan import INSTEAD, Solution, check_save, check_step, no_remainder, reversible_loop
 from jeuler.solving.chunks import Progress, can_be_in_chunks, check_progress, run_in_chunks
 from jeuler.solving.grid import Checkpoint, Grid
+from jeuler.solving.long_runs import check_resume, run_on_disk
 from jeuler.solving.loop import Loop, in_one_scan
 from jeuler.steps.explicit import Step, euler_step
 
@@ -47,6 +48,8 @@ def simulate(
     compensated: bool = False,
     windows: tuple[int, ...] | str = (),
     progress: Progress = None,
+    resume: Any = None,
+    checkpoint_every: int | None = None,
 ) -> Solution:
     """Run a scene: num_steps steps of its equation of motion and its effects, in one ``lax.scan``.
 
@@ -72,6 +75,8 @@ def simulate(
         the smallest of these many first slots that holds all that live or can be born, so that a large pool costs
         what is alive. Each size is compiled. Under ``vmap`` all sizes run: leave it empty there.
       progress: a bar, or a function to call, as in `solve`.
+      resume: path of a folder that keeps the run, as in `solve`.
+      checkpoint_every: steps between two states on disk, as in `solve`.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -84,6 +89,7 @@ def simulate(
     Source: W. T. Reeves, Particle Systems: A Technique for Modeling a Class of Fuzzy Objects, 1983.
     """
     check_progress(progress, checkpoint)
+    check_resume(resume, checkpoint_every, checkpoint)
     check_kinds(scene, state)
     check_parameters("scene", scene)
     grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint, many=can_be_in_chunks(checkpoint))
@@ -95,6 +101,8 @@ def simulate(
     settings = checkpoint, compensated, windows if isinstance(windows, str) else tuple(windows)
     if checkpoint == "reversible":  # looks at values
         return _simulate(*inputs, *settings)
+    if resume is not None:
+        return Solution(*run_on_disk(_loop, inputs, settings, grid, resume, checkpoint_every, progress))
     found = run_in_chunks(_loop, inputs, settings, grid, progress)
     return programs.call(_simulate, inputs, settings) if found is None else Solution(*found)
 

@@ -21,6 +21,7 @@ from jeuler.solving._reversible import reversible
 from jeuler.solving._tables import solution_table
 from jeuler.solving.chunks import Progress, can_be_in_chunks, check_progress, run_in_chunks
 from jeuler.solving.grid import Checkpoint, Grid
+from jeuler.solving.long_runs import check_resume, run_on_disk
 from jeuler.solving.loop import Loop, in_one_scan, watched
 from jeuler.steps.explicit import Step, VectorField, euler_step
 
@@ -91,6 +92,8 @@ def solve(
     compensated: bool = False,
     breaks: Any = (),
     progress: Progress = None,
+    resume: Any = None,
+    checkpoint_every: int | None = None,
 ) -> Solution:
     """Advance y' = f(t, y, args) by num_steps steps of size dt, in one ``lax.scan``.
 
@@ -124,6 +127,10 @@ def solve(
         sees f after it. Differentiable.
       progress: True shows a bar with an estimate of the end; a function is called as ``progress(step, num_steps)``
         about ten times a second, and what it raises ends the run. Not under jit, vmap or grad, nor with "reversible".
+      resume: path of a folder in which the run keeps its saved frames and its last state, and from which the same call
+        goes on, after a kill or for more steps, with the numbers of a run in one go. The leaves of ``y`` are then read
+        from disk where they are indexed or converted. It needs zarr, ``pip install 'jeuler[runs]'``.
+      checkpoint_every: steps between two states on disk; None for one each 10 s.
     Returns: `Solution`, saved states with leading axis num_steps // save_every + 1, initial value first.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -137,6 +144,7 @@ def solve(
     """
     y0 = checks.state("y0", y0)
     check_progress(progress, checkpoint)
+    check_resume(resume, checkpoint_every, checkpoint)
     many = can_be_in_chunks(checkpoint)
     grid = Grid.checked(dt, num_steps, t0, save_every, checkpoint, dtype=trees.time_dtype(y0), many=many)
     checks.field_form(f)
@@ -149,6 +157,8 @@ def solve(
     settings = checkpoint, compensated
     if checkpoint == "reversible":  # looks at values
         return _solve(*inputs, *settings)
+    if resume is not None:
+        return Solution(*run_on_disk(_loop, inputs, settings, grid, resume, checkpoint_every, progress))
     found = run_in_chunks(_loop, inputs, settings, grid, progress)
     return programs.call(_solve, inputs, settings) if found is None else Solution(*found)
 
