@@ -139,13 +139,14 @@ def warp(work: Work) -> Pair:
     whole = work.flat()
     x0, v0 = whole.position[0], whole.velocity[0]
     n, springs = len(x0), len(whole.edges)
+    device = "cuda" if jax.default_backend() == "gpu" else "cpu"
 
     def vectors(values, grad):
-        return wp.array(values, dtype=wp.vec3, device="cpu", requires_grad=grad)
+        return wp.array(values, dtype=wp.vec3, device=device, requires_grad=grad)
 
-    edges = wp.array(whole.edges, dtype=wp.vec2i, device="cpu")
-    rest = wp.array(whole.rest_length, dtype=float, device="cpu")
-    ks, kd = (wp.array([k], dtype=float, device="cpu", requires_grad=True) for k in (KS, KD))
+    edges = wp.array(whole.edges, dtype=wp.vec2i, device=device)
+    rest = wp.array(whole.rest_length, dtype=float, device=device)
+    ks, kd = (wp.array([k], dtype=float, device=device, requires_grad=True) for k in (KS, KD))
 
     def states(count, grad):
         made = [(vectors(x0, grad), vectors(v0, grad))]
@@ -154,8 +155,8 @@ def warp(work: Work) -> Pair:
     def advance(now, then, f):
         if springs:
             f.zero_()
-            wp.launch(kernels.spring_forces, springs, inputs=[*now, edges, rest, ks, kd, f], device="cpu")
-        wp.launch(kernels.move, n, inputs=[*now, f, *then, DT, whole.gravity, whole.drag], device="cpu")
+            wp.launch(kernels.spring_forces, springs, inputs=[*now, edges, rest, ks, kd, f], device=device)
+        wp.launch(kernels.move, n, inputs=[*now, f, *then, DT, whole.gravity, whole.drag], device=device)
 
     two, plain_force = states(2, False), vectors(0 * x0, False)
 
@@ -168,14 +169,14 @@ def warp(work: Work) -> Pair:
 
     history = states(whole.steps + 1, True)
     forces = [vectors(0 * x0, True) for _ in range(whole.steps)]
-    loss = wp.zeros(1, dtype=float, device="cpu", requires_grad=True)
+    loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
 
     def gradient():
         loss.zero_()
         with wp.Tape() as tape:
             for k in range(whole.steps):
                 advance(history[k], history[k + 1], forces[k])
-            wp.launch(kernels.sum_of_squares, n, inputs=[history[-1][0], loss], device="cpu")
+            wp.launch(kernels.sum_of_squares, n, inputs=[history[-1][0], loss], device=device)
         tape.backward(loss)
         out = [a.grad.numpy().copy() for a in (*history[0], ks, kd)]
         tape.zero()
@@ -252,7 +253,7 @@ PEERS: dict[str, Callable[[Work], Pair]] = {
     "diffrax Euler": diffrax_euler,
     "diffrax Euler, DirectAdjoint": diffrax_direct,
     "jax-md (no damper)": jax_md,
-    "Warp on CPU": warp,
+    "Warp": warp,
     "C, one thread": c_program,
     "NumPy": numpy_program,
 }

@@ -1,11 +1,12 @@
 """Run every peer on the same work, in turn, and print what it took.
 
-    python benchmarks/run.py [--all] [--rounds 7] [--out benchmarks/results]
+    python benchmarks/run.py [--all] [--rounds 7] [--platform gpu] [--out benchmarks/results]
 
 Times are medians over the rounds, in nanoseconds per spring (or free particle, or oscillator) and step; in a round each
 peer runs in turn, forward and gradient, so that what else the machine does hits all alike. The peers' results are
 compared before they are timed. Needs jax-md and warp-lang beside jeuler's own dependencies; a peer that is not
-installed is left out, and said so.
+installed is left out, and said so. On a GPU, JAX's CUDA wheels are all that is needed beside: the programs of JAX and
+Warp run there, C and NumPy on the CPU.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import oscillator
 from peers import PEERS
 from works import works
 
-NEEDS = {"jax-md (no damper)": "jax_md", "Warp on CPU": "warp"}
+NEEDS = {"jax-md (no damper)": "jax_md", "Warp": "warp"}
 FORWARD, GRADIENT = 0, 1
 
 
@@ -95,6 +96,8 @@ def versions() -> str:
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         compiler = "not installed"
+    device = jax.devices()[0]
+    cpu += "" if device.platform == "cpu" else f" with {device.device_kind}"
     head = f"{cpu}, {os.cpu_count()} cores, {platform.system()}; Python {platform.python_version()}, float32, "
     return head + ", ".join(found) + f", gcc {compiler}"
 
@@ -145,6 +148,17 @@ def figure(results: dict, path: pathlib.Path) -> None:
     fig.savefig(path, dpi=130)
 
 
+def on(kind: str | None) -> None:
+    """Have JAX run on a device of this kind, or end with one line that says what there is instead."""
+    if kind is None:
+        return
+    # "gpu" is no word for jax_platforms: it asks for CUDA and ROCm at once, and fails where one of the two is missing
+    jax.config.update("jax_platforms", "cpu" if kind == "cpu" else "")
+    if (found := jax.default_backend()) != kind:
+        hint = "; on a machine with an NVIDIA GPU, pip install 'jax[cuda13]'" if kind == "gpu" else ""
+        sys.exit(f"run.py: JAX finds no {kind} here, only a {found}{hint}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--all", action="store_true", help="also the large systems, up to a million springs")
@@ -152,7 +166,9 @@ def main() -> None:
     parser.add_argument("--no-memory", action="store_true", help="leave the table of memory out")
     parser.add_argument("--only", default="", help="only works whose name contains this")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(__file__).parent / "results")
+    parser.add_argument("--platform", choices=["cpu", "gpu", "tpu"], help="where JAX runs; without it, where it would")
     options = parser.parse_args()
+    on(options.platform)
     if jax.config.jax_enable_x64:
         sys.exit("run the benchmark without jax_enable_x64")
     options.out.mkdir(parents=True, exist_ok=True)
