@@ -117,11 +117,17 @@ def test_a_second_advice_or_diagnosis_of_the_same_equations_compiles_nothing():
     def advised(k):
         return jnp.asarray(jeuler.advise_step(lambda t, y, args: -k * y, 1.0, t1=1.0, error=1e-2).dt)
 
+    def chosen(k):
+        best = jeuler.advise_method(
+            lambda t, y, args: -k * y, 1.0, t1=1.0, error=1e-2, methods={"RK4": jeuler.rk4_step}
+        ).best
+        return jnp.asarray(best.dt)
+
     def diagnosed(ks):
         found = jeuler.diagnose(scene(ks), STATE, dt=0.01, num_steps=3, loss=lambda s: jnp.sum(s.position**2))
         return jnp.asarray(found.finite)
 
-    for run in (advised, diagnosed):
+    for run in (advised, chosen, diagnosed):
         first, second = compilations(run, (1.0,), (1.0,))
         assert first > 0
         assert second == 0

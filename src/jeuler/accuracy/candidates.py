@@ -142,6 +142,10 @@ class Problem:
         """The breaks between t0 and t1."""
         return tuple(t for t in self.breaks if self.t0 < t < self.t1)
 
+    def without_values(self) -> Problem:
+        """The equation alone, which is what a program is made of; it gets y0 and args when it runs."""
+        return dataclasses.replace(self, y0=None, args=None)
+
     def max_steps(self, candidate: Candidate) -> int:
         """Most steps of an adaptive run."""
         size = sum(leaf.size for leaf in jax.tree.leaves(self.y0))
@@ -154,8 +158,9 @@ def program(candidate: Candidate, problem: Problem) -> Any:
 
     setting: the number of steps, or the pair (rtol, atol).
     """
+    most, problem = problem.max_steps(candidate), problem.without_values()
     if candidate.adaptive:
-        return _adaptive(candidate, problem)
+        return _adaptive(candidate, problem, most)
     return _diffrax_fixed(candidate, problem) if is_diffrax(candidate.step) else _fixed(candidate, problem)
 
 
@@ -182,6 +187,7 @@ def written_out(candidate: Candidate, problem: Problem, num_steps: int) -> Any:
 
     As a user writes it: XLA may compile that to a program of another speed.
     """
+    problem = problem.without_values()
 
     def run(y0, args, t0, t1):
         found = solve(
@@ -211,7 +217,7 @@ def _diffrax_fixed(candidate: Candidate, problem: Problem) -> Any:
     return run
 
 
-def _adaptive(candidate: Candidate, problem: Problem) -> Any:
+def _adaptive(candidate: Candidate, problem: Problem, most: int) -> Any:
     if is_diffrax(candidate.step):
         import diffrax
 
@@ -220,7 +226,7 @@ def _adaptive(candidate: Candidate, problem: Problem) -> Any:
             if problem.inner_breaks:
                 jumps = jnp.asarray(problem.inner_breaks, t0.dtype)
                 controller = diffrax.ClipStepSizeController(controller, jump_ts=jumps)
-            return _solved(candidate, problem, y0, args, t0, t1, None, controller, problem.max_steps(candidate))
+            return _solved(candidate, problem, y0, args, t0, t1, None, controller, most)
 
         return run
 
@@ -235,7 +241,7 @@ def _adaptive(candidate: Candidate, problem: Problem) -> Any:
             step=candidate.step,
             rtol=rtol,
             atol=atol,
-            max_steps=problem.max_steps(candidate),
+            max_steps=most,
             breaks=problem.breaks,
         )
         return jax.tree.map(lambda leaf: leaf[-1], taken.y), taken.num_steps + taken.num_rejected

@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler._core.component import Function
 from jeuler._core.precision import cast, flat, precision
+from jeuler._jax import programs
 from jeuler.accuracy.candidates import Candidate, Problem, program, written_out
 from jeuler.accuracy.method import is_diffrax
 from jeuler.accuracy.pilot import distance
@@ -65,10 +67,12 @@ class Trial:
         self.compile_seconds, self.known = 0.0, {}
 
     def compiled_for(self, run: Any) -> Any:
+        """``(setting) -> result`` of ``run(y0, args, t0, t1, setting)``, by a program of before if one fits."""
         p = self.problem
         with precision(self.dtype):
             times = [jnp.asarray(t, self.dtype) for t in (p.t0, p.t1)]
-            return functools.partial(jax.jit(run), cast(p.y0, self.dtype), cast(p.args, self.dtype), *times)
+            given = cast(p.y0, self.dtype), cast(p.args, self.dtype), *times
+            return functools.partial(programs.prepared(_run, (Function(run), *given)), None)
 
     @functools.cached_property
     def program(self) -> Any:
@@ -135,6 +139,11 @@ class Trial:
         begun = time.perf_counter()
         self.final(setting if self.candidate.adaptive else 1)
         self.compile_seconds = time.perf_counter() - begun
+
+
+def _run(run: Function, y0: Any, args: Any, t0: Any, t1: Any, _: None, *setting: Any) -> Any:
+    """What is compiled; nothing is passed for the memory that it may take."""
+    return run.function(y0, args, t0, t1, *setting)
 
 
 @dataclasses.dataclass(frozen=True)
