@@ -37,7 +37,17 @@ def adaptive(k):
     return jeuler.solve_adaptive(lambda t, y, k: -k * y, jnp.ones(3), t1=0.1, args=k, rtol=1e-3, atol=1e-3).y.sum()
 
 
-@pytest.mark.parametrize("function", [solved, springs, collisions, births])
+def by_implicit_steps(k):
+    return jeuler.solve(lambda t, y, k: -k * y, jnp.ones(3), args=k, step=jeuler.implicit_euler_step, **GRID).y.sum()
+
+
+def undone(k):
+    scene = jeuler.Scene((jeuler.Springs([(0, 1), (1, 2)], k, 0.0, 1.0),))
+    how = GRID | {"step": jeuler.symplectic_euler_step, "checkpoint": "reversible"}
+    return jeuler.simulate(scene, STATE, **how).y.position.sum()
+
+
+@pytest.mark.parametrize("function", [solved, springs, collisions, births, adaptive, by_implicit_steps, undone])
 def test_runs_and_gradients_lower_for_accelerators(function):
     run = jax.jit(jax.value_and_grad(function))
     exported = jax.export.export(run, platforms=["cuda", "rocm", "tpu"])(jnp.float32(1.0))
@@ -54,9 +64,15 @@ def fitted(data):
     return jeuler.fit(residual, {"k": jnp.float32(1.0)}, max_iterations=5).params["k"]
 
 
-@pytest.mark.parametrize(("function", "argument"), [(adaptive, jnp.float32(1.0)), (fitted, jnp.ones(10, jnp.float32))])
-def test_adaptive_runs_and_fits_lower_for_accelerators(function, argument):
-    exported = jax.export.export(jax.jit(function), platforms=["cuda", "rocm", "tpu"])(argument)
+def fitted_springs(positions):
+    scene = jeuler.Scene((jeuler.Springs([(0, 1), (1, 2)], 1.0, 0.1, 1.0),))
+    return jeuler.fit_springs(scene, STATE, np.arange(1, 5) * 0.01, positions, dt=0.01, max_iterations=3).ks
+
+
+@pytest.mark.parametrize(("function", "shape"), [(fitted, (10,)), (fitted_springs, (4, 3, 2))])
+def test_fits_lower_for_accelerators(function, shape):
+    data = jnp.ones(shape, jnp.float32)
+    exported = jax.export.export(jax.jit(function), platforms=["cuda", "rocm", "tpu"])(data)
     assert set(exported.platforms) == {"cuda", "rocm", "tpu"}
 
 
@@ -64,7 +80,7 @@ def test_ensembles_lower_for_accelerators_in_either_order(monkeypatch):
     for last in (True, False):
         monkeypatch.setitem(platforms.BATCH_LAST, jax.default_backend(), last)
         run = jax.jit(lambda ks: jax.vmap(springs)(ks))
-        jax.export.export(run, platforms=["cuda", "tpu"])(jnp.ones(64))
+        jax.export.export(run, platforms=["cuda", "rocm", "tpu"])(jnp.ones(64))
 
 
 def test_the_order_of_a_batch_is_chosen_by_the_table(monkeypatch):
