@@ -17,3 +17,5 @@ gc.set_threshold(100_000, 20, 100)
 def random():
     """A NumPy generator with a fixed seed."""
     return np.random.default_rng(20240229)
+
+collect_ignore = ["_jax/on_a_mesh.py"]  # a program that a test runs in a process with eight devices
