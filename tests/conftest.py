@@ -18,4 +18,5 @@ def random():
     """A NumPy generator with a fixed seed."""
     return np.random.default_rng(20240229)
 
+
 collect_ignore = ["_jax/on_a_mesh.py"]  # a program that a test runs in a process with eight devices
