@@ -31,6 +31,7 @@ STEPS = {
     "extrapolated_euler(6)": jeuler.extrapolated_euler(6),
     "implicit_euler": jeuler.implicit_euler_step,
     "linearly_implicit_euler": jeuler.linearly_implicit_euler_step,
+    "implicit_midpoint": jeuler.implicit_midpoint_step,
 }
 LARGEST = 30  # numbers in the position of the largest net
 

@@ -45,6 +45,7 @@ STEPS = {
     "extrapolated": jeuler.extrapolated_euler(4),
     "implicit": jeuler.implicit_euler_step,
     "linearly implicit": jeuler.linearly_implicit_euler_step,
+    "midpoint": jeuler.implicit_midpoint_step,
     "symplectic": jeuler.symplectic_euler_step,
 }
 LONGEST, LONGEST_IMPLICIT = 3e9, 3e7  # numbers advanced

@@ -29,7 +29,8 @@ def relative_error(y, exact):
 
 def test_all_steps_of_the_library_and_four_of_diffrax_are_ranked_where_none_are_given():
     names = {candidate.name for candidate in default_candidates(decay, jnp.float64(1.0), 0.0, None)}
-    steps = {"euler_step", "heun_step", "rk4_step", "implicit_euler_step", "linearly_implicit_euler_step"}
+    steps = {f"{name}_step" for name in ("euler", "heun", "rk4", "implicit_euler", "linearly_implicit_euler")}
+    steps |= {"implicit_midpoint_step"}
     assert steps | {"solve_adaptive", "extrapolated_euler(4)", "solve_adaptive, linearly implicit"} <= names
     assert {f"diffrax.{name}" for name in ("Euler", "Heun", "Tsit5", "Kvaerno5")} <= names
     assert "symplectic_euler_step" not in names  # not a motion
@@ -146,6 +147,7 @@ def _none(candidates):
 def test_patience_bounds_what_is_begun():
     advice = jeuler.advise_method(decay, 1.0, t1=1.0, error=1e-2, methods=EXPLICIT, patience=1e-6)
     assert all("patience" in row.reason for row in advice.rows)
+    assert "were not tried, as patience= was over" in advice.reason
 
 
 def test_where_no_reference_is_known_nothing_is_ranked():

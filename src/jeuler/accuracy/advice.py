@@ -25,7 +25,7 @@ IMPLICIT_WORK = 16  # times the work of an explicit step that of one which solve
 LONGER = 8  # times that work where stability asks for it
 FEW = 64  # steps: one fewer may make a difference
 LARGER = 0.9  # part of the steps at whose dt instability is to be seen if it is what sets dt:
-NEAR_LIMIT = 0.2  # of the stable dt; and it grows by
+NEAR_LIMIT, NEAR_LIMIT_UNEVEN = 0.2, 0.5  # of the stable dt, more where jumps make errors grow too; and it grows by
 UNSTABLE = 4.0  # times the error that the order says
 
 
@@ -89,9 +89,9 @@ def advise_step(
 
     Where f jumps, pilots with 16, 32, 64, ... steps may all meet the jumps alike and agree on a wrong state. So the
     extrapolated state must also be that of an adaptive run, and runs with 0.93, 0.79 and 0.61 of the steps must have
-    the errors that the order tells of them. Where they have not, numbers of steps 10 % apart are run one by one, and
+    the errors that the order tells of them. Where they have not, numbers of steps 2 to 10 % apart are run one by one, and
     the answer is the first whose own run meets the target, with runs 1.5 and 3 % beside it within a factor 3; or, where
-    that is an accident of the jumps falling well on its grid, the first of up to 30 % more steps that comes near it.
+    that is an accident of the grid that the jumps fall on, the first of up to three times as many that is near it.
 
     The roundoff floor is measured on runs in float32 beside those in float64. For a y0 in float32 it was within a
     factor 3 of the floor that runs show in 36 of 37 cases (seven problems, three steps, plain and compensated) and 5 in
@@ -246,7 +246,7 @@ class _Answer:
         if total > search.error:
             return self.refusal(f"roundoff in {search.dtype} leaves no error below {total:.1e}", total)
         if error < search.error * search.scale(final) / FACTOR:
-            how = self.far_below(final, num_steps, search.error * search.scale(final) / error)
+            how = self.far_below(final, num_steps, search.error * search.scale(final) / error, NEAR_LIMIT_UNEVEN)
         else:
             how = "confirmed by a pilot run of that dt"
         reason = (
@@ -254,14 +254,14 @@ class _Answer:
         )
         return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
 
-    def far_below(self, final: Any, num_steps: int, better: float) -> str:
+    def far_below(self, final: Any, num_steps: int, better: float, part: float = NEAR_LIMIT) -> str:
         """Why an error is far below the target: as one step fewer misses it, or as larger dts grow or jump."""
         search, smaller = self.search, f"the error is {better:.2g} times smaller than asked"
         if num_steps == 1:
             return f"one step is enough: {smaller}"
         fewer = min(math.floor(LARGER * num_steps), num_steps - 1)
         growth = search.error_after(fewer, final) * better / (num_steps / fewer) ** search.order
-        if growth < UNSTABLE or not self.near_instability(num_steps):
+        if growth < UNSTABLE or not self.near_instability(num_steps, part):
             one_fewer = search.error_after(num_steps - 1, final)
             if num_steps <= FEW and one_fewer > AIM:
                 aimed = "" if one_fewer > 1 else f" ({AIM:g} is aimed at)"
@@ -272,9 +272,9 @@ class _Answer:
             how += f"; linearly_implicit_euler_step meets the target with {steps:,} step{'s' * (steps > 1)}"
         return how
 
-    def near_instability(self, num_steps: int) -> bool:
+    def near_instability(self, num_steps: int, part: float = NEAR_LIMIT) -> bool:
         """Whether dt is not far below a limit of stability at the states looked at."""
-        return self.search.interval / num_steps > NEAR_LIMIT * self.search.stability
+        return self.search.interval / num_steps > part * self.search.stability
 
     def needs(self) -> str:
         bound = self.search.bound

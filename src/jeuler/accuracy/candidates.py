@@ -25,6 +25,7 @@ from jeuler.steps.explicit import (
 )
 from jeuler.steps.extrapolated import extrapolated_euler
 from jeuler.steps.implicit import implicit_euler_step, linearly_implicit_euler_step
+from jeuler.steps.midpoint import implicit_midpoint_step
 
 PyTree = Any
 MOST_STEPS, MOST_IMPLICIT_STEPS = 65_536, 16_384  # of an adaptive run
@@ -84,7 +85,7 @@ def default_candidates(f: VectorField, y0: PyTree, t0: float, args: PyTree) -> l
             adaptive = isinstance(solver, diffrax.AbstractAdaptiveSolver)
             found += [Candidate(name, solver, adaptive, f"{name}()")]
     found.append(stiff_reference())
-    for step in (linearly_implicit_euler_step, implicit_euler_step):
+    for step in (linearly_implicit_euler_step, implicit_midpoint_step, implicit_euler_step):
         name = step.__name__
         found += [Candidate(name, step, False, f"jeuler.{name}")]
     return found

@@ -38,6 +38,7 @@ SLOWER = 6.0  # times the fastest so far
 FIRST = 1.0  # s, while there is none
 CLOSE = 3.0  # times the fastest: timed again, in turns, as `solve` runs them
 ROUNDS = 9
+NOT_TRIED = "not tried: patience= would be over"
 HEAD = "method", "dt, s", "rtol", "steps", "seconds", "error", "reason"
 
 
@@ -253,12 +254,13 @@ class _Ranking:
         rows = [self.row(candidate, found[candidate.name]) for candidate in candidates]
         rows.sort(key=lambda row: row.seconds if math.isfinite(row.seconds) else math.inf)
         advice = MethodAdvice(tuple(rows), self.error, "", known_to, 0.0)
-        reason = self.in_one_line(advice.best) + left_out
+        reason = self.in_one_line(advice.best, sum(row.reason == NOT_TRIED for row in rows), len(rows)) + left_out
         return dataclasses.replace(advice, reason=reason, trial_seconds=time.perf_counter() - begun)
 
-    def in_one_line(self, best: RankedMethod | None) -> str:
+    def in_one_line(self, best: RankedMethod | None, not_tried: int, count: int) -> str:
         if best is None:
-            return f"no method tried reaches an error of {self.error:g}"
+            time = f"; {not_tried} of {count} were not tried, as patience= was over: raise it" if not_tried else ""
+            return f"no method tried reaches an error of {self.error:g}{time}"
         how = f"rtol = {best.rtol:.1e}" if math.isfinite(best.rtol) else f"dt = {best.dt:.3g} s"
         steps = f"{best.num_steps:,} step{'s' * (best.num_steps != 1)}"
         return f"for an error of {self.error:g} use {best.name}, {how}, {steps}: {milliseconds(best.seconds)}"
@@ -296,7 +298,7 @@ class _Ranking:
             left = self.until - time.perf_counter()
             trial = self.trial(candidate, self.dtype)
             if left < (0.0 if trial.known else candidate.program_size * explicit_compile):
-                found[candidate.name] = Found(None, 0, math.nan, math.nan, "not tried: patience= would be over")
+                found[candidate.name] = Found(None, 0, math.nan, math.nan, NOT_TRIED)
                 continue
             seconds = FIRST if math.isinf(fastest) else max(SHORT, SLOWER * fastest)
             target = Target(self.error, final, self.scale(final), seconds, self.size)

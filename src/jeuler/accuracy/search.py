@@ -33,7 +33,7 @@ REGULAR = 0.25  # and the observed order be this close to the step's own, to pre
 OFF = 0.93, 0.79, 0.61  # parts of the finest rung: numbers of steps that share no pattern with it
 EVEN = 2.5  # times the error that the order of the step tells of them
 BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
-ACCIDENT = 1.3  # times the fewest steps at most, for an error that is no accident of the grid
+ACCIDENT = 3  # times the fewest steps at most, for an error that is no accident of the grid
 FINER, FINE = 1.1, 1.02  # from one number of steps to the next where errors are uneven, many or few
 REFERENCE_RTOL = 1e-8, 1e-11, 1e-13  # of adaptive runs; the first that agrees with the one before is the reference
 REFERENCE_STEPS, STIFF_REFERENCE_STEPS = 65_536, 8_192
@@ -307,34 +307,34 @@ class Search:
         """The fewest steps of a scan whose own run meets the aim, with runs beside it near.
 
         The numbers of steps are 2 % apart where these are few, and else 10 % and then 1 %. They begin at a quarter of
-        what stability asks for, half if that is many, or at ``start``. Where an error is far below the target while
-        runs beside it are above, the jumps happen to fall well on that grid: up to 30 % more steps are looked at for a
-        run whose error is no such accident.
+        what stability asks for, half if that is many, or at ``start``. An error far below the target beside others that
+        are not is an accident of where the jumps fall on that grid: it is taken only if no other number of steps up to
+        three times as many will do.
         """
         many = self.most > self.planned
-        least = start or max(1, math.floor(self.interval / self.bound / (2 if many else 4)))
+        num_steps = start or max(1, math.floor(self.interval / self.bound / (2 if many else 4)))
         error_of = functools.cache(functools.partial(self.error_after, final=final))
-        beside = lambda n: [error_of(max(1, round(n * part))) for part in BESIDE]  # noqa: E731
-        meets = lambda n: error_of(n) <= AIM and max(beside(n)) <= FACTOR  # noqa: E731
-        near = lambda n: error_of(n) >= 1 / FACTOR and meets(n)  # noqa: E731
-        num_steps, spent = least, 0
-        while num_steps <= self.most and spent <= 2 * self.most:
+        beside = lambda n: max(error_of(max(1, round(n * part))) for part in BESIDE)  # noqa: E731
+        meets = lambda n: error_of(n) <= AIM and beside(n) <= FACTOR  # noqa: E731
+        least, accident, spent, found = num_steps, 0, 0, 0
+        while not found and num_steps <= min(self.most, accident or self.most) and spent <= 2 * self.most:
             if meets(num_steps):
-                break
+                if error_of(num_steps) >= 1 / FACTOR or beside(num_steps) <= 1 / FACTOR:
+                    found = num_steps
+                accident = accident or ACCIDENT * num_steps
             spent += num_steps
             finer = FINE if num_steps <= self.planned // 32 else FINER
             num_steps = max(num_steps + 1, round(finer * num_steps))
-        else:
+        found = found or accident // ACCIDENT
+        if not found:
             return None
-        fewer = [n for n in map(math.ceil, np.linspace(num_steps / FINER, num_steps, 10)) if n >= least]
-        if error_of(num_steps) < 1 / FACTOR and not many:
-            num_steps = next((n for n in fewer if meets(n)), num_steps)
-        if math.isinf(error_of(round(num_steps / FINER))):
-            num_steps = self.on_edge(error_of, num_steps)
-        elif error_of(num_steps) < 1 / FACTOR and max(beside(num_steps)) > 1:
-            more = [*fewer, *np.ceil(num_steps * np.linspace(1.01, ACCIDENT, 30)).astype(int).tolist()]
-            num_steps = next((n for n in more if n <= self.most and near(n)), num_steps)
-        return num_steps, error_of(num_steps) * self.error * self.scale(final)
+        if math.isinf(error_of(round(found / FINER))):
+            found = self.on_edge(error_of, found)
+        elif error_of(found) < 1 / FACTOR and not many:
+            between = (math.ceil(n) for n in np.linspace(found / FINER, found * FINER, 20))
+            near = (n for n in between if n >= least and error_of(n) >= 1 / FACTOR and meets(n))
+            found = next(near, found)
+        return found, error_of(found) * self.error * self.scale(final)
 
     def on_edge(self, error_of: Callable[[int], float], high: int) -> int:
         """The fewest steps, to a hundredth, that meet the aim and are stable, as they are with dt 1 % larger."""
