@@ -155,7 +155,7 @@ def _fit(
     asked = options.start(arguments.start)
     if arguments.friction != "compare":
         return estimate(model, measured, guess, dt, asked, arguments.max_iterations), []
-    kinds = [("viscous",), ("quadratic",), ("dry",), ("viscous", "dry"), ("viscous", "quadratic")]
+    kinds = [("viscous",), ("quadratic",), ("dry",), ("viscous", "dry"), ("viscous", "quadratic"), ("quadratic", "dry")]
     tried = [
         estimate(dataclasses.replace(model, friction=kind), measured, guess, dt, asked, arguments.max_iterations)
         for kind in kinds
