@@ -89,7 +89,7 @@ def advise_step(
 
     Where f jumps, pilots with 16, 32, 64, ... steps may all meet the jumps alike and agree on a wrong state. So the
     extrapolated state must also be that of an adaptive run, and runs with 0.93, 0.79 and 0.61 of the steps must have
-    the errors that the order tells of them. Where they have not, numbers of steps 2 to 10 % apart are run one by one, and
+    the errors that the order tells of them. Where they have not, numbers of steps 2 to 10 % apart are run in turn, and
     the answer is the first whose own run meets the target, with runs 1.5 and 3 % beside it within a factor 3; or, where
     that is an accident of the grid that the jumps fall on, the first of up to three times as many that is near it.
 
