@@ -53,7 +53,7 @@ from jeuler.forces import (
 )
 from jeuler.particles import ParticleState, Scene, empty_pool, simulate, uses
 from jeuler.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
-from jeuler.solving import AdaptiveSolution, Solution, solve, solve_adaptive
+from jeuler.solving import AdaptiveSolution, Ensemble, Moments, Quantiles, Solution, ensemble, solve, solve_adaptive
 from jeuler.steps import (
     StabilityLimit,
     cap_cotangent,
@@ -123,6 +123,7 @@ __all__ = [
     "DistanceLinks",
     "DryFriction",
     "Emitter",
+    "Ensemble",
     "Fit",
     "FoundSprings",
     "FromDisc",
@@ -136,6 +137,7 @@ __all__ = [
     "LinearDrag",
     "Method",
     "MethodAdvice",
+    "Moments",
     "Normal",
     "OverLife",
     "ParticleState",
@@ -144,6 +146,7 @@ __all__ = [
     "PointAttractor",
     "PrescribedMotion",
     "QuadraticDrag",
+    "Quantiles",
     "RankedMethod",
     "Recording",
     "SampledPath",
@@ -174,6 +177,7 @@ __all__ = [
     "compare_fits",
     "diagnose",
     "empty_pool",
+    "ensemble",
     "euler_step",
     "extrapolated_euler",
     "find_springs",

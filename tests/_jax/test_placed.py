@@ -13,4 +13,4 @@ def test_every_way_to_place_a_batch_gives_what_one_device_gives():
         [sys.executable, script], env=os.environ | {"XLA_FLAGS": flags}, capture_output=True, text=True
     )
     assert run.returncode == 0, run.stderr[-3000:]
-    assert len(run.stdout.splitlines()) == 9
+    assert len(run.stdout.splitlines()) == 11

@@ -1,0 +1,92 @@
+"""A million members of a damped oscillator, 1,000 steps: `ensemble` beside ten batches of 100,000 by hand.
+
+python benchmarks/ensembles.py million [MEMBERS]
+python benchmarks/ensembles.py processes [MEMBERS]     two processes by jax.distributed on loopback, beside one
+"""
+
+import json
+import resource
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jeuler
+
+
+def drawn(count):
+    rng = np.random.default_rng(0)
+    ks, kd = rng.normal(10, 1, count), rng.normal(0.3, 0.03, count)
+    return {"ks": np.asarray(ks, np.float32), "kd": np.asarray(kd, np.float32)}
+
+
+def end(member):
+    def field(t, y, args):
+        return y[1], -args["ks"] * y[0] - args["kd"] * y[1]
+
+    how = {"dt": 0.001, "num_steps": 1000, "step": jeuler.symplectic_euler_step, "save_every": 1000}
+    return jeuler.solve(field, (jnp.float32(1), jnp.float32(0)), args=member, **how).y[0][-1]
+
+
+def by_hand(members, batches=10):
+    program = jax.jit(jax.vmap(end))
+    size = len(members["ks"]) // batches
+    parts = [{name: x[n * size : (n + 1) * size] for name, x in members.items()} for n in range(batches)]
+    ends = np.concatenate([np.asarray(program(part)) for part in parts])
+    return ends.mean(), ends.var(ddof=1), np.quantile(ends, (0.05, 0.5, 0.95))
+
+
+def with_ensemble(members, **how):
+    reduce = {"moments": jeuler.Moments(), "quantiles": jeuler.Quantiles((0.05, 0.5, 0.95))}
+    found = jeuler.ensemble(end, members, reduce=reduce, **how)
+    moments = found.reduced["moments"]
+    return float(moments.mean), float(moments.variance), found.reduced["quantiles"].quantiles.tolist()
+
+
+def million(count=1_000_000):
+    members = drawn(count)
+    seconds = {"ensemble": [], "by hand": []}
+    for _ in range(3):  # in turn, so that both see the same load
+        for name, way in {"ensemble": with_ensemble, "by hand": by_hand}.items():
+            start = time.perf_counter()
+            answer = way(members)
+            seconds[name].append(time.perf_counter() - start)
+            print(f"{name:10s} {seconds[name][-1]:6.2f} s, mean {answer[0]:.6f}, variance {answer[1]:.6e}, {answer[2]}")
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    ratio = np.median(seconds["ensemble"]) / np.median(seconds["by hand"])
+    print(
+        f"ratio of medians {ratio:.2f}, {1e6 * min(seconds['ensemble']) / count:.2f} ns a step, {most:.2f} GiB at most"
+    )
+
+
+def processes(count=100_000):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    children = [
+        subprocess.Popen([sys.executable, __file__, "child", str(n), address, str(count)], stdout=subprocess.PIPE)
+        for n in range(2)
+    ]
+    answers = [json.loads(child.communicate()[0].splitlines()[-1]) for child in children]
+    print("two processes", answers[0])
+    print("the same in both", answers[0] == answers[1])
+    print("one process  ", with_ensemble(drawn(count)))
+
+
+def child(number, address, count):
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.distributed.initialize(address, num_processes=2, process_id=int(number))
+    mesh = jax.make_mesh((jax.device_count(),), ("member",))
+    print(json.dumps(with_ensemble(drawn(int(count)), mesh=mesh)))
+
+
+if __name__ == "__main__":
+    task, *rest = sys.argv[1:]
+    if task == "child":
+        child(*rest)
+    else:
+        {"million": million, "processes": processes}[task](*map(int, rest))

@@ -1,0 +1,237 @@
+"""``ensemble``: one run for many members, in batches that fit memory, on one device or on all of a mesh."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from jeuler._core import checks
+from jeuler._core.component import Function, result
+from jeuler._jax import programs
+from jeuler.solving._scan import Solution
+from jeuler.solving.chunks import Progress, _telling, check_progress
+
+PyTree = Any
+MEMORY = 2**26  # bytes of the results of a batch, where the user does not say how large,
+MOST = 2**14  # members at most
+
+
+@result
+class Ensemble:
+    """What became of the members.
+
+    Attributes:
+      results: what the run gave, each leaf with a leading axis (member, ...); None where it was reduced.
+      reduced: what ``reduce`` made of the results of the members that were not lost; None without it.
+      lost: the numbers of the members that were lost, (lost,), rising: their results hold a number that is not finite.
+      count: how many members there were.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> found = jeuler.ensemble(lambda x: 1 / x, jnp.array([1.0, 0.0, 2.0]))
+      >>> found.count, found.lost.tolist(), found.results.tolist()
+      (3, [1], [1.0, inf, 0.5])
+    """
+
+    results: PyTree
+    reduced: Any
+    lost: np.ndarray
+    count: int
+
+
+def ensemble(
+    run: Callable[[PyTree], PyTree],
+    members: PyTree,
+    *,
+    batch: int | None = None,
+    mesh: Any = None,
+    reduce: Any = None,
+    progress: Progress = None,
+) -> Ensemble:
+    """Run each member, batch after batch, and keep the results or what a reducer makes of them.
+
+        results[i] = run(members[i])
+
+    Args:
+      run: a function of one member, which calls `solve` or `simulate` and returns a pytree of arrays, such as the last
+        state. Written for one, it may depend on the member in all but shapes: start, parameters, key, dt.
+      members: a pytree of arrays with a leading axis (member, ...).
+      batch: members at once; None for as many as give 64 MiB of results, at most 16,384. On a mesh, a multiple of its
+        devices.
+      mesh: a ``jax.sharding.Mesh``: each batch is divided over all its devices, which send nothing to each other. With
+        ``jax.distributed`` all processes make the same call with the same members.
+      reduce: a reducer such as `Moments` or `Quantiles`, or a dictionary of them, so that the results need not be
+        stored. An object of your own with their four methods does too.
+      progress: True shows a bar; a function is called as ``progress(member, members)`` after each batch.
+    Returns: `Ensemble`.
+    Raises: ValueError, before tracing, if the members have no common leading axis, or a batch does not fit the mesh.
+    Example:
+      >>> import jax, jax.numpy as jnp, jeuler
+      >>> def end(ks):
+      ...     run = jeuler.solve(lambda t, y, ks: (y[1], -ks * y[0]), (1.0, 0.0), args=ks, dt=0.01, num_steps=100)
+      ...     return run.y[0][-1]
+      >>> stiffness = 1 + 0.1 * jax.random.normal(jax.random.key(0), (1000,))
+      >>> found = jeuler.ensemble(end, stiffness, reduce=jeuler.Moments())
+      >>> round(float(found.reduced.mean), 2), found.lost.size
+      (0.54, 0)
+    """
+    checks.function("run", run, "(member) -> results", "write run=lambda member: jeuler.solve(...).y, say")
+    count = _number_of(members)
+    check_progress(progress, None)
+    if programs.is_transformed():
+        raise ValueError(
+            "ensemble works outside of jit, vmap and grad, got a call inside; write jax.vmap(run)(members)"
+        )
+    reducers = reduce if isinstance(reduce, dict) else {} if reduce is None else {"": reduce}
+    for name, one in reducers.items():
+        if not all(hasattr(one, method) for method in ("start", "add", "merge", "value")):
+            raise ValueError(f"reduce must have start, add, merge and value, got {checks.shown(one)} {name}".rstrip())
+    size = _size_of_batch(run, members, count, batch, mesh)
+    work = _Work(run, tuple(reducers.items()), mesh, size)
+    with _telling(progress, count) as tell:
+        for first in range(0, count, size):
+            some = slice(first, first + size)
+            work.batch(jax.tree.map(operator.itemgetter(some), members), min(size, count - first))
+            if tell:
+                tell(min(first + size, count))
+    results, states, lost = work.end(count)
+    values = {name: one.value(states[name]) for name, one in reducers.items()}
+    reduced = None if reduce is None else values if isinstance(reduce, dict) else values[""]
+    return Ensemble(results, reduced, np.flatnonzero(lost), count)
+
+
+def _number_of(members: PyTree) -> int:
+    sizes = {np.shape(x)[:1] for x in jax.tree.leaves(members)}
+    if len(sizes) != 1 or sizes == {()} or sizes == {(0,)}:
+        shapes = [np.shape(x) for x in jax.tree.leaves(members)]
+        raise ValueError(f"members must be arrays with one leading axis (member, ...), got the shapes {shapes}")
+    return next(iter(sizes))[0]
+
+
+def _size_of_batch(run: Callable, members: PyTree, count: int, batch: int | None, mesh: Any) -> int:
+    devices = 1 if mesh is None else mesh.size
+    if batch is not None:
+        checks.count("batch", batch, least=1)
+        if batch % devices:
+            raise ValueError(f"batch must be a multiple of the {devices} devices of the mesh, got {batch}")
+        return batch
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x)[1:], x.dtype), members)
+    form = checks.form_of("run", run, one)
+    each = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(form))
+    size = int(np.clip(MEMORY // max(each, 1), 1, MOST))
+    return min(size, -(-count // devices)) * devices
+
+
+class _Work:
+    """The batches of one call."""
+
+    def __init__(self, run: Callable, reducers: tuple, mesh: Any, size: int) -> None:
+        self.mesh, self.size, self.reducers = mesh, size, reducers
+        self.axes: Any = None if mesh is None else PartitionSpec(mesh.axis_names)
+        self.begin = programs.prepared(_first_states, (Function(run),), (reducers,))
+        self.step = programs.prepared(_next, (Function(run),), (reducers, mesh))
+        self.states: PyTree = None
+        self.results: list[PyTree] = []
+        self.lost: list[Any] = []
+
+    def batch(self, members: PyTree, count: int) -> None:
+        members = jax.tree.map(self._padded, members)
+        real = np.arange(self.size) < count
+        if self.states is None:
+            states = self.begin({}, members, real)
+            self.states = states if self.mesh is None else jax.tree.map(self._on_each_device, states)
+        self.states, results, lost = self.step(self.states, *jax.tree.map(self._placed, (members, real)))
+        self.lost.append(lost)
+        if not self.reducers:
+            # on the host, so that the memory of the device holds one batch
+            self.results.append(jax.tree.map(np.asarray, results) if jax.process_count() == 1 else results)
+
+    def _padded(self, x: Any) -> Any:
+        missing = self.size - len(x)
+        if not missing:
+            return x
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jnp.concatenate([x, jnp.repeat(x[-1:], missing, axis=0)])
+        return np.concatenate([np.asarray(x), np.repeat(np.asarray(x[-1:]), missing, axis=0)])
+
+    def _placed(self, x: Any) -> Any:
+        if self.mesh is None:
+            return x
+        sharding = NamedSharding(self.mesh, self.axes)
+        if jax.process_count() == 1 or jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.device_put(x, sharding)
+        return jax.make_array_from_callback(np.shape(x), sharding, lambda index: x[index])
+
+    def _on_each_device(self, x: Any) -> Any:
+        return self._placed(np.broadcast_to(np.asarray(x), (self.mesh.size, *x.shape)))
+
+    def end(self, count: int) -> tuple[PyTree, dict[str, PyTree], np.ndarray]:
+        """All results, the states of the reducers, and which members were lost."""
+        lost = np.concatenate([self._whole(x) for x in self.lost])[:count]
+        results = None
+        if not self.reducers:
+            pieces = [jax.tree.map(self._whole, piece) for piece in self.results]
+            results = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
+        states = self.states
+        if self.mesh is not None:
+            states = jax.tree.map(self._whole, states)
+            parts = [jax.tree.map(lambda x, n=n: jnp.asarray(x[n]), states) for n in range(self.mesh.size)]
+            states = parts[0]
+            for part in parts[1:]:
+                states = {name: one.merge(states[name], part[name]) for name, one in self.reducers}
+        return results, states, lost
+
+    def _whole(self, x: Any) -> np.ndarray:
+        if self.mesh is None or jax.process_count() == 1:
+            return np.asarray(x)
+        from jax.experimental import multihost_utils
+
+        return np.asarray(multihost_utils.process_allgather(x, tiled=True))
+
+
+def _batch(run: Function, members: PyTree, real: Any) -> tuple[PyTree, Any]:
+    results = jax.vmap(run.function)(members)
+    return results, ~_finite(results) & real
+
+
+def _finite(results: PyTree) -> Any:
+    """Which members have only finite results, and no run among them that was lost on its way."""
+    runs = jax.tree.leaves(results, is_leaf=lambda x: isinstance(x, Solution))
+    found = [one.first_nonfinite < 0 for one in runs if isinstance(one, Solution)]
+    for x in jax.tree.leaves(results):
+        if jnp.issubdtype(x.dtype, jnp.inexact):
+            found.append(jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))))
+    whole = jnp.ones(len(jax.tree.leaves(results)[0]), bool)
+    for one in found:
+        whole = whole & one
+    return whole
+
+
+def _first_states(run: Function, reducers: tuple, _: PyTree, members: PyTree, real: Any) -> PyTree:
+    results, lost = _batch(run, members, real)
+    return {name: one.start(results, real & ~lost) for name, one in reducers}
+
+
+def _next(run: Function, reducers: tuple, mesh: Any, states: PyTree, members: PyTree, real: Any) -> tuple:
+    """States, results (none where they are reduced), and which members were lost, after a batch."""
+
+    def one_device(states, members, real):
+        results, lost = _batch(run, members, real)
+        if not reducers:
+            return states, results, lost
+        return {name: one.add(states[name], results, real & ~lost) for name, one in reducers}, None, lost
+
+    if mesh is None:
+        return one_device(states, members, real)
+
+    def of_device(states, members, real):
+        states, *rest = one_device(jax.tree.map(lambda x: x[0], states), members, real)
+        return jax.tree.map(lambda x: x[None], states), *rest
+
+    spec = PartitionSpec(mesh.axis_names)
+    return jax.shard_map(of_device, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)(states, members, real)
