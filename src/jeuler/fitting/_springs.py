@@ -12,6 +12,7 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.fitting.asked import ASKED
 from jeuler.fitting.beside import attach, attached
+from jeuler.fitting.errors import BLIND
 from jeuler.fitting.held_out import judged, recordings_without
 from jeuler.fitting.measured.readings import SENSOR_PARAMETERS
 from jeuler.fitting.measured.recording import Recording, listed
@@ -258,7 +259,7 @@ def fit_springs(
         start=begun,
         **fields,
     )
-    for name in (AGAIN, ASKED, DENSITY):
+    for name in (AGAIN, ASKED, BLIND, DENSITY):
         attach(complete, name, attached(found.fit, name))
     attach(complete, RECORDING, task)
     return complete

@@ -14,7 +14,8 @@ from jeuler.fitting.asked import ASKED
 from jeuler.fitting.beside import attached
 from jeuler.fitting.unknowns import Layout, readable
 
-UNSEEN = 1e-10  # share of the largest eigenvalue of the correlations below which one is rounding
+BLIND = "blind directions"  # under this name those of the params, (n, k), are kept beside a result
+SEEN = 1e-5  # of a change along one of them: less is rounding
 
 
 def error_of(found: Any, of: str | Callable[[Any], Any]) -> float:
@@ -29,7 +30,12 @@ def error_of(found: Any, of: str | Callable[[Any], Any]) -> float:
     error = np.asarray(layout.vector(found.stderr), float)
     if isinstance(of, str):
         return float(error[np.argmax(direction)])
-    return _through(np.asarray(found.covariance, float), direction, np.isfinite(error))
+    blind = np.zeros((len(error), 0)) if np.isfinite(error).all() else attached(found, BLIND)
+    if blind is None:
+        raise ValueError("standard_error of a function needs the fit as `fit` gave it, not a copy; fit again")
+    seen = np.abs(direction @ blind) <= SEEN * (np.abs(direction) @ np.abs(blind))  # else it moves with what is not
+    covariance = np.asarray(found.covariance, float)
+    return float(np.sqrt(max(float(direction @ covariance @ direction), 0.0))) if seen.all() else float(np.inf)
 
 
 def _of_name(layout: Layout, name: str) -> np.ndarray:
@@ -50,18 +56,3 @@ def _of_function(layout: Layout, params: Any, of: Any) -> np.ndarray:
     if not np.isfinite(slope).all():
         raise ValueError("of must have a finite derivative at the fitted params, got one that is not finite")
     return slope
-
-
-def _through(covariance: np.ndarray, direction: np.ndarray, known: np.ndarray) -> float:
-    """sqrt(c^T C c); inf where c has a part of what the data do not determine."""
-    variance = np.diag(covariance)
-    size = np.sqrt(np.where(variance > 0, variance, 1))
-    if not known.all():
-        if np.any(direction[~known & (variance <= 0)]):
-            return float(np.inf)
-        c = direction * size
-        values, vectors = np.linalg.eigh(covariance / size / size[:, None])
-        unseen = vectors[:, values <= UNSEEN * values.max(initial=0)]
-        if np.linalg.norm(unseen.T @ c) > 1e-5 * np.linalg.norm(c):
-            return float(np.inf)
-    return float(np.sqrt(max(float(direction @ covariance @ direction), 0.0)))

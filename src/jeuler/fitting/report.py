@@ -9,6 +9,7 @@ import numpy as np
 from jeuler.fitting import least_squares
 from jeuler.fitting.beside import attach
 from jeuler.fitting.blind import describe_blind
+from jeuler.fitting.errors import BLIND
 from jeuler.fitting.factors import namespace
 from jeuler.fitting.least_squares import State
 from jeuler.fitting.losses import LOSSES
@@ -94,6 +95,7 @@ def report(
         **quality,
     )
     attach(fit, INVERSE, errors.inverse)
+    attach(fit, BLIND, errors.null)
     return fit
 
 
@@ -109,6 +111,7 @@ class _Errors(NamedTuple):
     autocorrelation: float | None = None
     correlated: bool = False
     inverse: Any = None  # of J^T J
+    null: Any = None  # the blind directions, (n, k)
 
 
 def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors:
@@ -121,7 +124,8 @@ def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors
         error, white = (
             np.where(found.blind, np.inf, np.sqrt(np.maximum(np.diag(c), 0))) for c in (found.covariance, found.white)
         )
-        blind = describe_blind(found.directions.null(), x, layout.names(readable), np.asarray(problem.lower) >= 0)
+        null = found.directions.null()
+        blind = describe_blind(null, x, layout.names(readable), np.asarray(problem.lower) >= 0)
     doubtful = (problem.lower == 0) & (x > 0) & (error > x) & ~found.blind
     return _Errors(
         stderr=layout.params(error),
@@ -133,6 +137,7 @@ def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors
         autocorrelation=float(found.autocorrelation) if np.isfinite(found.autocorrelation) else None,
         correlated=bool(np.any(found.covariance != found.white)),
         inverse=found.inverse,
+        null=null,
     )
 
 
