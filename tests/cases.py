@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jeuler
+from jeuler._core.component import component
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +94,27 @@ STRAND_VELOCITY = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 0.2], [0.2, 0.5, -0.1],
 STRAND_REST = np.array([[[0.0, 0.0, 0.0], [0.3, 0.1, -0.2], [0.2, 0.4, -0.4], [0.5, 0.3, -0.8]]])
 FLOOR = jeuler.Plane([0.0, 0.4], [0.1, 1.0])
 
+NEAR = jeuler.Neighbours(cutoff=1.4, skin=0.2, capacity=3)
+
+
+@component()
+class AllPairs:
+    """Forces of those that are near, on four particles of which all see all."""
+
+    forces: tuple
+
+    def __call__(self, t, position, velocity, mass):
+        rows = jnp.asarray([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]], jnp.int32)
+        return sum(force(t, position, velocity, mass, rows) for force in self.forces)
+
+
+def of_those_near():
+    fluid = jeuler.Fluid(NEAR, mass=0.5, density=0.3, stiffness=4.0, viscosity=0.2)
+    return AllPairs((jeuler.SoftRepulsion(NEAR, 1.3, 20.0, 0.5), jeuler.Flocking(NEAR, 1.0, 2.0, 3.0), fluid))
+
+
 FORCES = {
+    "nearby": of_those_near,
     "cubic_springs": lambda: jeuler.CubicSprings(NET_EDGES, np.linspace(20.0, 60.0, 5), 0.7, 0.9, cubic=30.0),
     "strings": lambda: jeuler.Strings(NET_EDGES, ks=30.0, kd=0.7, rest_length=np.linspace(0.9, 1.3, 5)),
     "torsion": lambda: jeuler.Torsion(STRAND, 0.4, 2.0),
@@ -168,6 +189,10 @@ EFFECTS = {
     "colliding_pairs": effect(lambda: jeuler.Collisions(pairs=[(1, 2)], radius=0.2, restitution=0.5), "unresolved_contacts"),
     "distance_links": effect(lambda: jeuler.DistanceLinks([(0, 1), (1, 2)], length=[1.0, 0.8]), "unresolved_links"),
     "breaking": effect(lambda: jeuler.Breaking(jeuler.BreakableSprings(NET_EDGES, 30.0, 0.7, 0.9), 0.4), "broken", "broken_springs"),
+    "neighbours": effect(
+        lambda: jeuler.Neighbours(1.0, 0.2, capacity=3),
+        "neighbours", "neighbours_made_at", "has_neighbours", "missed_neighbours",
+    ),
     "speed_limit": effect(lambda: jeuler.SpeedLimit(0.5)),
     "emitter": effect(lambda: jeuler.Emitter(40.0, PLACE, SPEED, max_births=2), *POOL),
     "emitter_of_a_disc": effect(
@@ -200,7 +225,7 @@ EFFECTS = {
 
 def kinds_in(part):
     """The names of the public classes in a force or effect, at any depth."""
-    ours = type(part).__module__.startswith("jeuler")
+    ours = type(part).__module__.startswith(("jeuler", "cases"))
     children = part if isinstance(part, (tuple, list)) else vars(part).values() if ours else ()
     return {type(part).__name__}.intersection(jeuler.__all__).union(*map(kinds_in, children))
 

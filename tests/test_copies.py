@@ -42,7 +42,7 @@ def assert_equal(a, b):
         assert len(a) == len(b)
         for x, y in zip(a, b, strict=True):
             assert_equal(x, y)
-    elif type(a).__module__.startswith("jeuler"):
+    elif type(a).__module__.startswith(("jeuler", "cases")):
         assert_equal(vars(a), vars(b))
     else:
         assert a is b or a == b or (a != a and b != b)

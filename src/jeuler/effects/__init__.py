@@ -5,6 +5,7 @@ from jeuler.effects.births import Emitter
 from jeuler.effects.breaking import Breaking
 from jeuler.effects.deaths import Death, DeathOnContact, DeathOutside, Lifetime
 from jeuler.effects.distance import DistanceLinks
+from jeuler.effects.neighbours import Neighbours
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "DistanceLinks",
     "Emitter",
     "Lifetime",
+    "Neighbours",
     "OverLife",
     "PrescribedMotion",
     "SampledPath",

@@ -8,6 +8,7 @@ from jeuler.forces.fields import Gravity
 from jeuler.forces.friction import DryFriction
 from jeuler.forces.hair import StrandBending, StrandCore, strand_edges
 from jeuler.forces.links import BreakableSprings, CubicSprings, Strings
+from jeuler.forces.nearby import Flocking, Fluid, SoftRepulsion
 from jeuler.forces.neighbours import Bending, Viscosity
 from jeuler.forces.soft_body import ShapeMatching
 from jeuler.forces.springs import Springs
@@ -19,12 +20,15 @@ __all__ = [
     "BreakableSprings",
     "CubicSprings",
     "DryFriction",
+    "Flocking",
+    "Fluid",
     "Gravity",
     "Gust",
     "LinearDrag",
     "PointAttractor",
     "QuadraticDrag",
     "ShapeMatching",
+    "SoftRepulsion",
     "Springs",
     "StrandBending",
     "StrandCore",

@@ -32,10 +32,11 @@ DEFAULTS: dict[str, tuple[tuple[int, ...], Any]] = {
 class FieldForm(NamedTuple):
     """A field of the user's own, or of an effect: shape, and value (of its type) where nothing gave one.
 
-    The shape is that of one particle's value, or of the field if it is ``whole``: one for the system.
+    The shape is that of one particle's value, or of the field if it is ``whole``: one for the system. "dim" in it is
+    the dimension of space.
     """
 
-    shape: tuple[int, ...]
+    shape: tuple[Any, ...]
     value: Any
     whole: bool = False
 
@@ -263,6 +264,7 @@ def with_default_fields(
             else:
                 form = DEFAULTS.get(name, (shapes or {}).get(name, ()))
                 shape, value, *whole = form if name in DEFAULTS or isinstance(form, FieldForm) else (form, 0.0)
+                shape = tuple(state.position.shape[1] if n == "dim" else n for n in shape)
                 kind = {bool: bool, int: jnp.int32}.get(type(value), dtype)
                 values[name] = jnp.full(shape if any(whole) else (particles, *shape), value, kind)
     return state.replace(**values) if values else state
