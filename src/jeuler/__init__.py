@@ -55,7 +55,7 @@ from jeuler.forces import (
     strand_edges,
     turbulence,
 )
-from jeuler.particles import ParticleState, Scene, empty_pool, simulate, uses
+from jeuler.particles import ParticleState, Scene, empty_pool, export, simulate, uses
 from jeuler.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
 from jeuler.solving import AdaptiveSolution, Ensemble, Moments, Quantiles, Solution, ensemble, solve, solve_adaptive
 from jeuler.steps import (
@@ -187,6 +187,7 @@ __all__ = [
     "empty_pool",
     "ensemble",
     "euler_step",
+    "export",
     "extrapolated_euler",
     "find_springs",
     "fit",

@@ -1,5 +1,6 @@
 """Particles, the scene of forces and effects that moves them, and the run."""
 
+from jeuler.particles._export import export
 from jeuler.particles._simulate import simulate
 from jeuler.particles.fields import uses
 from jeuler.particles.scene import Scene
@@ -9,6 +10,7 @@ __all__ = [
     "ParticleState",
     "Scene",
     "empty_pool",
+    "export",
     "simulate",
     "uses",
 ]

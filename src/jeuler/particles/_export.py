@@ -1,0 +1,104 @@
+"""Runs of particles as files that other programs open."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
+from jeuler.particles.state import ParticleState
+
+
+@says_what_to_write()
+def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
+    """Write a run of particles to files, by the end of the path.
+
+    ".npz" holds the times and each field of the state, as NumPy reads them. ".xyz" is one file of all saved times in
+    extended XYZ, for OVITO. ".vtk" is one file for each saved time, run_0000.vtk and so on, for ParaView: particles as
+    points, edges as lines. In .xyz and .vtk the dead are left out, and what lies on a line or in a plane has 0 as the
+    other coordinates.
+
+    Args:
+      solution: what `simulate` returned, its ``.y`` a `ParticleState` with leading axis saved.
+      path: where to; its folder must be there.
+      edges: pairs of particles drawn as lines, integers (edge, 2), such as ``springs.edges``; for .vtk. One with a dead
+        end is left out.
+    Returns: the paths that were written, in the order of time.
+    Raises: ValueError, if the solution holds no states, or the path ends otherwise.
+    Example:
+      >>> import os, tempfile, jax.numpy as jnp, numpy as np, jeuler
+      >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.ones((3, 2)))
+      >>> run = jeuler.simulate(jeuler.Scene(), state, dt=0.5, num_steps=2)
+      >>> with tempfile.TemporaryDirectory() as folder:
+      ...     (path,) = jeuler.export(run, os.path.join(folder, "run.npz"))
+      ...     np.load(path)["position"].shape
+      (3, 3, 2)
+    """
+    path = pathlib.Path(path)
+    if not isinstance(solution.y, ParticleState) or np.ndim(solution.y.position) != 3:
+        raise ValueError(
+            "export needs a solution whose .y is a ParticleState with leading axis saved; run simulate with save=None, "
+            "and take one member of a batch"
+        )
+    writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk}
+    if path.suffix not in writers:
+        raise ValueError(f"export writes {', '.join(writers)}, got {path.name!r}; give the path one of these ends")
+    pairs = np.asarray(edges, int).reshape(-1, 2) if len(edges) else np.zeros((0, 2), int)
+    particles = solution.y.position.shape[1]
+    if pairs.size and not (pairs.min() >= 0 and pairs.max() < particles):
+        raise ValueError(f"edges must be indices of the {particles} particles, got {checks.shown(pairs.tolist())}")
+    return writers[path.suffix](solution, path, pairs)
+
+
+def _write_npz(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
+    fields: dict[str, Any] = {name: np.asarray(getattr(solution.y, name)) for name in solution.y.fields()}
+    np.savez_compressed(path, t=np.asarray(solution.t), **fields)
+    return [path]
+
+
+def _living(state: ParticleState, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Who lives at a saved time, and their positions and velocities, (living, 3)."""
+    position, velocity = np.asarray(state.position[n]), np.asarray(state.velocity[n])
+    here = np.ones(len(position), bool) if state.alive is None else np.asarray(state.alive[n])
+    empty = [(0, 0), (0, 3 - position.shape[1])]
+    return here, np.pad(position, empty)[here], np.pad(velocity, empty)[here]
+
+
+def _write_xyz(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
+    with path.open("w", encoding="utf-8") as file:
+        for n, t in enumerate(np.asarray(solution.t)):
+            here, x, v = _living(solution.y, n)
+            file.write(f"{len(x)}\nProperties=id:I:1:pos:R:3:velo:R:3 Time={t:.9g}\n")
+            np.savetxt(file, np.column_stack([np.flatnonzero(here), x, v]), fmt=["%d", *["%.9g"] * 6])
+    return [path]
+
+
+def _write_vtk(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
+    """Legacy VTK, https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html."""
+    written = []
+    for n, t in enumerate(np.asarray(solution.t)):
+        here, x, v = _living(solution.y, n)
+        number = np.cumsum(here) - 1
+        lines = number[pairs[here[pairs].all(axis=1)]]
+        own = path.with_name(f"{path.stem}_{n:04d}{path.suffix}")
+        with own.open("w", encoding="utf-8") as file:
+            file.write(f"# vtk DataFile Version 3.0\nt = {t:.9g} s\nASCII\nDATASET POLYDATA\nPOINTS {len(x)} double\n")
+            np.savetxt(file, x, fmt="%.9g")
+            _write_cells(file, "VERTICES", np.arange(len(x))[:, None])
+            _write_cells(file, "LINES", lines)
+            file.write(f"POINT_DATA {len(x)}\nVECTORS velocity double\n")
+            np.savetxt(file, v, fmt="%.9g")
+        written.append(own)
+    return written
+
+
+def _write_cells(file: Any, kind: str, cells: np.ndarray | Sequence[Any]) -> None:
+    cells = np.asarray(cells)
+    if len(cells):
+        count, corners = cells.shape
+        file.write(f"{kind} {count} {count * (corners + 1)}\n")
+        np.savetxt(file, np.column_stack([np.full(count, corners), cells]), fmt="%d")

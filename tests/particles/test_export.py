@@ -1,0 +1,48 @@
+"""Files of runs: what is read back is what was written."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jeuler
+from jeuler import ParticleState, Scene, Solution
+
+
+def run():
+    alive = jnp.array([[True, True, True], [True, False, True]])
+    position = jnp.arange(12.0).reshape(2, 3, 2)
+    state = ParticleState(position, -position, mass=jnp.ones((2, 3)), alive=alive, extra={"heat": position[..., 0]})
+    return Solution(jnp.array([0.0, 0.5]), state, jnp.int32(-1))
+
+
+def test_npz_holds_every_field(tmp_path):
+    (path,) = jeuler.export(run(), tmp_path / "run.npz")
+    found = np.load(path)
+    assert set(found) == {"t", "position", "velocity", "mass", "alive", "heat"}
+    np.testing.assert_array_equal(found["position"], run().y.position)
+
+
+def test_xyz_has_the_living_at_each_time(tmp_path):
+    (path,) = jeuler.export(run(), tmp_path / "run.xyz")
+    lines = path.read_text().splitlines()
+    assert (lines[0], lines[5]) == ("3", "2")
+    assert lines[6].endswith("Time=0.5")
+    assert lines[7:] == ["0 6 7 0 -6 -7 0", "2 10 11 0 -10 -11 0"]
+
+
+def test_vtk_has_points_and_the_lines_between_the_living(tmp_path):
+    first, second = jeuler.export(run(), tmp_path / "run.vtk", edges=[[0, 1], [0, 2]])
+    assert (first.name, second.name) == ("run_0000.vtk", "run_0001.vtk")
+    assert "LINES 2 6\n2 0 1\n2 0 2\n" in first.read_text()
+    text = second.read_text()
+    assert "POINTS 2 double\n6 7 0\n10 11 0\nVERTICES 2 4\n1 0\n1 1\nLINES 1 3\n2 0 1\nPOINT_DATA 2\n" in text
+
+
+def test_what_cannot_be_written_is_said(tmp_path):
+    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, got 'run\.usd'"):
+        jeuler.export(run(), tmp_path / "run.usd")
+    with pytest.raises(ValueError, match="edges"):
+        jeuler.export(run(), tmp_path / "run.vtk", edges=[[0, 3]])
+    single = jeuler.simulate(Scene(), ParticleState(jnp.zeros((1, 1)), jnp.zeros((1, 1))), dt=0.1, num_steps=1)
+    with pytest.raises(ValueError, match="ParticleState"):
+        jeuler.export(Solution(single.t, single.y.position, single.first_nonfinite), tmp_path / "run.npz")
