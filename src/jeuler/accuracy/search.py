@@ -317,13 +317,13 @@ class Search:
         beside = lambda n: max(error_of(max(1, round(n * part))) for part in BESIDE)  # noqa: E731
         meets = lambda n: error_of(n) <= AIM and beside(n) <= FACTOR  # noqa: E731
         least, accident, spent, found = num_steps, 0, 0, 0
-        while not found and num_steps <= min(self.most, accident or self.most) and spent <= 2 * self.most:
+        while not found and num_steps <= min(self.most, accident or self.most) and spent <= 3 * self.most:
             if meets(num_steps):
                 if error_of(num_steps) >= 1 / FACTOR or beside(num_steps) <= 1 / FACTOR:
                     found = num_steps
                 accident = accident or ACCIDENT * num_steps
             spent += num_steps
-            finer = FINE if num_steps <= self.planned // 32 else FINER
+            finer = FINE if num_steps <= self.planned // 64 else FINER
             num_steps = max(num_steps + 1, round(finer * num_steps))
         found = found or accident // ACCIDENT
         if not found:
