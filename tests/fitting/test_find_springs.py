@@ -165,3 +165,30 @@ def test_wrong_input_is_one_line(net, change, expected):
     with pytest.raises(ValueError, match=expected) as error:
         jeuler.find_springs(call.pop("times"), call.pop("positions"), **call)
     assert "\n" not in str(error.value)
+
+
+def test_where_accelerations_leave_a_choice_the_whole_motion_makes_it():
+    """The setting of Neural Relational Inference, 10 balls, noise 0.01, by the closed form: 5 runs of 45 pairs.
+
+    The accelerations alone have 94 of 100 pairs right there; without noise all are.
+    """
+    pairs, times, wrong = np.stack(np.triu_indices(10, 1), axis=1), 0.1 * np.arange(49), 0
+    said = 0
+    for seed in range(5):
+        draw = np.random.default_rng(seed)
+        true = draw.random(45) < 0.5
+        ends = np.zeros((45, 10))
+        ends[np.arange(45), pairs[:, 0]], ends[np.arange(45), pairs[:, 1]] = 1, -1
+        squares, modes = np.linalg.eigh(0.1 * ends[true].T @ ends[true])
+        omega = np.sqrt(np.maximum(squares, 1e-12))
+        place, speed = (0.5 * modes.T @ draw.normal(size=(10, 2)) for _ in range(2))
+        phase = np.outer(times, omega)[:, :, None]
+        x = np.einsum("ak,tkd->tad", modes, np.cos(phase) * place + np.sin(phase) / omega[:, None] * speed)
+        for noise in (0.0, 0.01)[seed > 0 :]:
+            found = jeuler.find_springs(times, x + noise * draw.normal(size=x.shape), mass=1.0, refine=False)
+            got = np.isin(10 * pairs[:, 0] + pairs[:, 1], 10 * found.edges[:, 0] + found.edges[:, 1])
+            wrong += np.sum(got != true)
+            said += "the whole motion made it" in found.message
+            assert noise or not (wrong or said)
+    assert said
+    assert wrong <= 0.04 * 5 * 45

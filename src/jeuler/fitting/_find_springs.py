@@ -13,6 +13,7 @@ from jeuler._core.component import result
 from jeuler.fitting._springs import SpringFit
 from jeuler.fitting.finding.refined import refined, springs_of
 from jeuler.fitting.finding.tracked import Tracked
+from jeuler.fitting.finding.whole_motion import by_whole_motion, in_doubt
 from jeuler.fitting.finding.words import hiding, not_explained, sentences
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -119,10 +120,17 @@ def find_springs(
         raise ValueError(f"false_positives must be a chance between 0 and 1, got {false_positives:g}")
     task = Tracked.of(times, positions, mass, candidates, forces, sigma)
     normal, found = task.searched(float(false_positives))
+    again = by_whole_motion(task, normal, found, float(false_positives)) if in_doubt(task, found) else None
+    found = found if again is None else again
     explained = not not_explained(normal, found)
     values = springs_of(task, found)
     hidden = hiding(task, found)
     words = list(sentences(task, normal, found, float(false_positives), hidden))
+    if again is not None:
+        words.append(
+            "where the accelerations leave a choice, the whole motion made it: springs of half the usual stiffness or "
+            "more in the most likely net"
+        )
     fit = None
     if refine and len(found.chosen):
         values, fit, more = refined(task, found, values, explained)

@@ -65,6 +65,16 @@ def select(normal: Normal, alpha: float, begin: list[int], kinds: bool = True) -
     return min(found, key=lambda one: _information(one, found, normal.rows))
 
 
+def selected(normal: Normal, terms: tuple[bool, bool, bool], chosen: list[int], alpha: float) -> Selection:
+    """What the equations of motion say of springs that were chosen otherwise; those that they make negative are not."""
+    use = np.flatnonzero(terms)
+    limit = _threshold(alpha / max(normal.gram.shape[0] // len(TERMS), 1), len(use))
+    fit = _Fit(normal, use, sorted(chosen))
+    while len(fit.chosen) and (fit.x[:: len(use)] <= 0).any():
+        fit = _Fit(normal, use, fit.chosen[fit.x[:: len(use)] > 0].tolist())
+    return fit.selection(terms, limit)
+
+
 def _information(one: Selection, found: list[Selection], rows: int) -> float:
     """Bayes' information criterion, in units of the noise that the best of them leaves."""
     surplus = min(other.surplus for other in found)
