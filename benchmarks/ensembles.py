@@ -1,10 +1,12 @@
 """A million members of a damped oscillator, 1,000 steps: `ensemble` beside ten batches of 100,000 by hand.
 
 python benchmarks/ensembles.py million [MEMBERS]
+python benchmarks/ensembles.py devices [MEMBERS]       on 1, 2, 4 and 8 devices of one machine
 python benchmarks/ensembles.py processes [MEMBERS]     two processes by jax.distributed on loopback, beside one
 """
 
 import json
+import os
 import resource
 import socket
 import subprocess
@@ -16,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jeuler
+
+BATCH = 2**14
 
 
 def drawn(count):
@@ -74,14 +78,33 @@ def processes(count=100_000):
     answers = [json.loads(child.communicate()[0].splitlines()[-1]) for child in children]
     print("two processes", answers[0])
     print("the same in both", answers[0] == answers[1])
-    print("one process  ", with_ensemble(drawn(count)))
+    print("one process  ", with_ensemble(drawn(count), batch=BATCH))
+
+
+def devices(count=1_000_000):
+    """The same members on 1, 2, 4 and 8 devices that JAX makes of this machine's cores."""
+    for number in (1, 2, 4, 8):
+        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={number}"
+        command = [sys.executable, __file__, "on_devices", str(count)]
+        subprocess.run(command, env=os.environ | {"XLA_FLAGS": flags}, check=True)
+
+
+def on_devices(count):
+    mesh = jax.make_mesh((jax.device_count(),), ("member",))
+    members = drawn(count)
+    seconds = []
+    for _ in range(4):
+        start = time.perf_counter()
+        with_ensemble(members, mesh=mesh, batch=2**17)
+        seconds.append(time.perf_counter() - start)
+    print(f"{mesh.size} devices {min(seconds[1:]):.2f} s, first call {seconds[0]:.2f} s")
 
 
 def child(number, address, count):
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(address, num_processes=2, process_id=int(number))
     mesh = jax.make_mesh((jax.device_count(),), ("member",))
-    print(json.dumps(with_ensemble(drawn(int(count)), mesh=mesh)))
+    print(json.dumps(with_ensemble(drawn(int(count)), mesh=mesh, batch=BATCH)))
 
 
 if __name__ == "__main__":
@@ -89,4 +112,5 @@ if __name__ == "__main__":
     if task == "child":
         child(*rest)
     else:
-        {"million": million, "processes": processes}[task](*map(int, rest))
+        tasks = {"million": million, "processes": processes, "devices": devices, "on_devices": on_devices}
+        tasks[task](*map(int, rest))

@@ -91,6 +91,11 @@ def test_three_thousand_million_steps_are_counted(tmp_path):
     np.testing.assert_array_equal(np.asarray(run.y[0]), circle(40, save_every=10).y[0])
 
 
+def test_a_scene_whose_state_counts_its_steps_refuses_more_than_it_can_count(tmp_path):
+    with pytest.raises(ValueError, match="at most 2,147,483,647"):
+        fountain(3_000_000_000, resume=tmp_path / "run")
+
+
 def test_other_runs_and_broken_folders_are_told(tmp_path):
     circle(20, resume=tmp_path / "run")
     for other in ({"dt": 0.02}, {"step": jeuler.rk4_step}, {"save_every": 2}):

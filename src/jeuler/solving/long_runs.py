@@ -15,7 +15,7 @@ from jeuler._core import checks
 from jeuler._core.component import replace
 from jeuler._jax import programs
 from jeuler.solving.chunks import EPOCH, FEWEST, Progress, Sizes, _begin, _chunk, _telling
-from jeuler.solving.grid import Grid
+from jeuler.solving.grid import COUNTER, Grid
 from jeuler.solving.loop import Loop
 from jeuler.solving.store import Store
 
@@ -110,6 +110,12 @@ class Run:
     def to_end(self, checkpoint_every: int | None, progress: Progress) -> tuple[Any, PyTree, Any, Any]:
         """The fields of a `Solution`."""
         grid, total = self.grid, self.grid.num_steps
+        paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(self.state)]
+        if total > COUNTER and any(path.endswith(".steps") for path in paths):
+            raise ValueError(
+                f"num_steps must be at most {COUNTER:,} in a scene with births or random effects, whose state counts "
+                f"its steps in 32 bits, got {total:,}"
+            )
         if self.done > total:
             raise ValueError(
                 f"num_steps must be at least {self.done:,}, the steps that the run in {self.store.path} has behind it, "

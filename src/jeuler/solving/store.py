@@ -134,7 +134,7 @@ class Store:
         """These first frames, ``count``, from that place on."""
         with self.errors():
             for array, x in zip(self.arrays, jax.tree.leaves(frames), strict=True):
-                array[place : place + count] = np.asarray(x[:count])
+                array[place : place + count] = np.asarray(x)[:count]  # to slice on the device compiles for each count
 
     def keep(self, state: PyTree, steps: int, **numbers: int) -> None:
         """The state after so many steps, in place of the one before: one or the other is there at each moment."""
