@@ -113,3 +113,14 @@ def test_what_cannot_be_right_is_said():
     ):
         with pytest.raises(ValueError, match=match):
             wrong()
+
+
+def test_a_newborn_in_a_slot_of_zeros_feels_nobody_before_it_has_a_row():
+    """Slot 0 is near; the zeros of a dead row are no neighbours."""
+    near = Neighbours(1.0, 0.2, capacity=3)
+    burst = jeuler.Emitter(0.0, [0.5], [0.0], bursts=((0.0, 1),), max_births=1)
+    pool = ParticleState(jnp.zeros((2, 1)), jnp.zeros((2, 1)), alive=jnp.array([True, False]))
+    scene = Scene((SoftRepulsion(near, 1.0, 8.0),), (burst, near))
+    run = jeuler.simulate(scene, pool, dt=0.1, num_steps=2, key=jax.random.key(0)).y
+    assert not run.velocity[1].any()
+    np.testing.assert_allclose(run.velocity[2, :, 0], [-0.4, 0.4])

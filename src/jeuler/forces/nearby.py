@@ -48,7 +48,7 @@ class _Nearby:
     neighbours: Any
     alive: Any
 
-    reads: ClassVar[tuple[str, ...]] = ("neighbours",)
+    reads: ClassVar[tuple[str, ...]] = ("neighbours", "has_neighbours")
 
     def _store(self, *names: str) -> None:
         name = type(self).__name__
@@ -65,11 +65,11 @@ class _Nearby:
     def check(self, particles: int, dim: int) -> None:
         self.neighbours.check(particles, dim)
 
-    def _pairs(self, position: Array, rows: Array) -> Pairs:
+    def _pairs(self, position: Array, rows: Array, made: Array | None) -> Pairs:
         dtype, x = position.dtype, split(position)
         box = self.neighbours.box
         boxes = [None] * len(x) if box is None else list(box.astype(dtype))
-        here = rows >= 0
+        here = (rows >= 0) & (rows < len(position))  # a window may have left a dead one behind
         who = jnp.where(here, rows, 0)
         # stored: each of several sums over the rows would look them up again
         d = [stored(nearest_image(one[:, None] - one[who], side)) for one, side in zip(x, boxes, strict=True)]
@@ -77,6 +77,8 @@ class _Nearby:
         here = here & apart(square) & (square < self.neighbours.cutoff.astype(dtype) ** 2)
         if self.alive is not None:
             here = here & self.alive[who] & self.alive[:, None]
+            if made is not None:  # a newborn is seen, and sees, once it has a row: from its second step on
+                here = here & made[who] & made[:, None]
         return Pairs(who, here, d, jnp.sqrt(jnp.where(here, square, 1)))
 
     def _force(self, pairs: Pairs, shares: list[Array], rows: Array) -> Array:
@@ -98,8 +100,8 @@ class SoftRepulsion(_Nearby):
       diameter: s, (), m: the distance at which two touch. Differentiable.
       ks: (), N/m. Differentiable.
       kd: (), N s/m. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass, neighbours)``, (particle, dim), N; NaN where the state's
-      rows were never made, as outside of a run.
+    Returns: called as a force ``(t, position, velocity, mass, neighbours, has_neighbours)``, (particle, dim), N; NaN
+      where the state's rows were never made, as outside of a run. A newborn has its row from its second step on.
     Raises: ValueError, if neighbours are none or a number is negative; in `simulate`, if the diameter is above the
       cutoff.
     Example:
@@ -125,8 +127,16 @@ class SoftRepulsion(_Nearby):
     def __post_init__(self) -> None:
         self._store("diameter", "ks", "kd")
 
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, neighbours: Array) -> Array:
-        pairs = self._pairs(position, neighbours)
+    def __call__(
+        self,
+        t: Any,
+        position: Array,
+        velocity: Array,
+        mass: Array,
+        neighbours: Array,
+        has_neighbours: Array | None = None,
+    ) -> Array:
+        pairs = self._pairs(position, neighbours, has_neighbours)
         s, ks, kd = (x.astype(position.dtype) for x in (self.diameter, self.ks, self.kd))
         overlap = jnp.maximum(s - pairs.r, 0)
         v = split(velocity)
@@ -158,8 +168,8 @@ class Flocking(_Nearby):
       separation: (), m/s^2. Differentiable.
       alignment: (), 1/s. Differentiable.
       cohesion: (), 1/s^2. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass, neighbours)``, (particle, dim), N; NaN where the state's
-      rows were never made, as outside of a run.
+    Returns: called as a force ``(t, position, velocity, mass, neighbours, has_neighbours)``, (particle, dim), N; NaN
+      where the state's rows were never made, as outside of a run. A newborn has its row from its second step on.
     Raises: ValueError, if neighbours are none or a number is negative.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -187,8 +197,16 @@ class Flocking(_Nearby):
     def __post_init__(self) -> None:
         self._store("separation", "alignment", "cohesion")
 
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, neighbours: Array) -> Array:
-        pairs, v = self._pairs(position, neighbours), split(velocity)
+    def __call__(
+        self,
+        t: Any,
+        position: Array,
+        velocity: Array,
+        mass: Array,
+        neighbours: Array,
+        has_neighbours: Array | None = None,
+    ) -> Array:
+        pairs, v = self._pairs(position, neighbours, has_neighbours), split(velocity)
         a, b, c = (x.astype(position.dtype) for x in (self.separation, self.alignment, self.cohesion))
         reach = self.neighbours.cutoff.astype(position.dtype)
         square = pairs.r**2
@@ -219,8 +237,8 @@ class Fluid(_Nearby):
       density: that at rest, (), kg/m^dim. Differentiable.
       stiffness: (), m^2/s^2. Differentiable.
       viscosity: dynamic, (), Pa s in space. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass, neighbours)``, (particle, dim), N; NaN where the state's
-      rows were never made, as outside of a run.
+    Returns: called as a force ``(t, position, velocity, mass, neighbours, has_neighbours)``, (particle, dim), N; NaN
+      where the state's rows were never made, as outside of a run. A newborn has its row from its second step on.
     Raises: ValueError, if neighbours are none, or a number is negative.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -253,16 +271,24 @@ class Fluid(_Nearby):
 
     def densities(self, position: Array, neighbours: Array) -> Array:
         """rho of each particle, (particle,), kg/m^dim."""
-        return self._densities(self._pairs(position, neighbours), position)
+        return self._densities(self._pairs(position, neighbours, None), position)
 
     def _densities(self, pairs: Pairs, position: Array) -> Array:
         reach, dim = self.neighbours.cutoff.astype(position.dtype), position.shape[1]
         kernel = jnp.where(pairs.here, (1 - (pairs.r / reach) ** 2) ** 3, 0)
         return self.mass.astype(position.dtype) * (1 + jnp.sum(kernel, axis=1)) * KERNEL[dim] / reach**dim
 
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, neighbours: Array) -> Array:
+    def __call__(
+        self,
+        t: Any,
+        position: Array,
+        velocity: Array,
+        mass: Array,
+        neighbours: Array,
+        has_neighbours: Array | None = None,
+    ) -> Array:
         dtype, dim = position.dtype, position.shape[1]
-        pairs, v = self._pairs(position, neighbours), split(velocity)
+        pairs, v = self._pairs(position, neighbours, has_neighbours), split(velocity)
         m, rest, stiffness, viscosity = (
             x.astype(dtype) for x in (self.mass, self.density, self.stiffness, self.viscosity)
         )
