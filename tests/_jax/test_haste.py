@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeuler._jax import haste
+import jeuler
+from jeuler._jax import haste, programs
 
 
 @pytest.mark.parametrize("how", ["none", "some", "great"])
@@ -24,3 +25,28 @@ def test_without_these_options_the_program_is_a_plain_one(monkeypatch):
 def test_other_errors_are_not_swallowed():
     with pytest.raises(ZeroDivisionError):
         haste.jit_in_haste(lambda x: x + 1 // 0, "great")(1.0)
+
+
+def area(x):
+    return jnp.sum(x * jnp.sin(x))
+
+
+@pytest.mark.parametrize(
+    "around", [lambda f: f, jax.grad, jax.jit, jax.vmap, lambda f: jax.jit(jax.linearize(f, 0.5)[1])]
+)
+def test_a_run_in_haste_can_be_differentiated_batched_and_compiled_again(around):
+    def run(x):
+        return programs.call(area, (x,), (), "some")
+
+    x = jnp.linspace(0.0, 1.0, 3) if around is jax.vmap else jnp.asarray(0.7)
+    np.testing.assert_allclose(around(run)(x), around(area)(x), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("colliders", "pairs", "long"),
+    [(1, 0, False), (2, 0, True), (0, 1, True), (1, 32, True), (1, 33, False), (0, 0, False)],
+)
+def test_runs_of_few_contacts_that_may_be_several_at_once_are_compiled_in_haste(colliders, pairs, long):
+    floor = jeuler.contact.Plane([0.0], [1.0])
+    contact = jeuler.Collisions((floor,) * colliders, pairs=[(k, k + 1) for k in range(pairs)], radius=0.1)
+    assert contact.is_long_code is long

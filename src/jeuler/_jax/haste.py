@@ -24,12 +24,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
 }
 
 
-def jit_in_haste(function: Callable[..., Any], haste: Haste) -> Callable[..., Any]:
+def jit_in_haste(function: Callable[..., Any], haste: Haste, **settings: Any) -> Callable[..., Any]:
     """``jax.jit``, on a CPU with less work for the compiler; plain where this version of XLA has no such options."""
-    plain = jax.jit(function)
+    plain = jax.jit(function, **settings)
     if haste == "none" or jax.default_backend() != "cpu":
         return plain
-    chosen = [jax.jit(function, compiler_options=OPTIONS[haste])]
+    chosen = [jax.jit(function, compiler_options=OPTIONS[haste], **settings)]
 
     @functools.wraps(function)
     def call(*arguments: Any) -> Any:

@@ -27,6 +27,7 @@ from jeuler._core.component import Function, Partitioned
 from jeuler._core.precision import setting
 from jeuler._jax.apart import apart
 from jeuler._jax.captured import CYCLE, Opaque, WithArrays, is_named, token, trusted
+from jeuler._jax.haste import Haste, jit_in_haste
 from jeuler._jax.placed import is_placed, may_be_placed
 
 MOST = 128  # programs kept; the one not used for the longest goes first
@@ -65,7 +66,7 @@ by_whole = Kept(MOST)  # the same programs, by the structure of inputs in which 
 current = threading.local()  # the inputs of the call that is being traced
 
 
-def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
+def call(function: Callable, inputs: tuple, settings: tuple = (), haste: Haste = "none") -> Any:
     """function(*inputs, *settings) by a program kept from an earlier call where there is one.
 
     Args:
@@ -73,13 +74,14 @@ def call(function: Callable, inputs: tuple, settings: tuple = ()) -> Any:
       inputs: pytrees of arrays and numbers; functions and other callables, each wrapped in ``Function``, may depend on
         anything. The function gets these wrapped as well.
       settings: hashable values that are part of the program.
+      haste: with how little work of XLA's optimiser it is compiled, where no derivative or batch is asked for.
     """
     if setting("jax_disable_jit") or _under_jit():
         return _on_a_mesh(function, inputs, settings)
-    return prepared(function, inputs, settings)()
+    return prepared(function, inputs, settings, haste)()
 
 
-def prepared(function: Callable, inputs: tuple, settings: tuple = ()) -> Call:
+def prepared(function: Callable, inputs: tuple, settings: tuple = (), haste: Haste = "none") -> Call:
     """`call`, for several calls of the same inputs: ``prepared(...)(*further)`` passes further pytrees of arrays.
 
     What comes back takes the memory of the first of these, which cannot be used again.
@@ -92,10 +94,10 @@ def prepared(function: Callable, inputs: tuple, settings: tuple = ()) -> Call:
             program = None
         if program is not None:
             return Call(function, settings, inputs, program, plain, [])
-    return _compared(function, inputs, settings, whole)
+    return _compared(function, inputs, settings, whole, haste)
 
 
-def _compared(function: Callable, inputs: tuple, settings: tuple, whole: Any) -> Call:
+def _compared(function: Callable, inputs: tuple, settings: tuple, whole: Any, haste: Haste) -> Call:
     """`prepared`, of inputs whose functions have to be compared by what they can reach."""
     classes: set[type] = set()
     leaves, structure = _flattened(inputs, classes)
@@ -107,7 +109,7 @@ def _compared(function: Callable, inputs: tuple, settings: tuple, whole: Any) ->
     except (Opaque, TypeError):  # a TypeError: something that has no hash
         return Call(function, settings, inputs)
     if program is None:
-        program = by_structure.put(key, Program(function, settings, structure, tokens))
+        program = by_structure.put(key, Program(function, settings, structure, tokens, haste))
     if not classes and all(map(_is_constant, leaves)):
         by_whole.put((function, settings, whole), program)
     return Call(function, settings, inputs, program, dynamic, arrays)
@@ -150,7 +152,7 @@ class Call:
 class Program:
     """A function compiled for one structure of its inputs; ``jax.jit`` keeps it for each shape, dtype and device."""
 
-    def __init__(self, function: Callable, settings: tuple, structure: Any, tokens: tuple) -> None:
+    def __init__(self, function: Callable, settings: tuple, structure: Any, tokens: tuple, haste: Haste) -> None:
         self.needs_values = False
         self.notes: dict[Any, Any] = {}  # what its callers keep with it
 
@@ -158,12 +160,15 @@ class Program:
             leaves = _put_together(_flattened(current.inputs)[0], tokens, dynamic, arrays)
             return function(*jax.tree.unflatten(structure, leaves), *settings, *first, *rest)
 
-        self.compiled = jax.jit(apart(run), donate_argnums=2)
+        run = apart(run)
+        self.compiled = jax.jit(run, donate_argnums=2)
+        self.in_haste = self.compiled if haste == "none" else jit_in_haste(run, haste, donate_argnums=2)
 
     def __call__(self, inputs: tuple, dynamic: list | None, arrays: list | None, further: tuple) -> Any:
         before, current.inputs = getattr(current, "inputs", None), inputs
         try:
-            return self.compiled(dynamic, arrays, further[:1], further[1:])
+            compiled = self.compiled if is_transformed() else self.in_haste  # options are for whole programs
+            return compiled(dynamic, arrays, further[:1], further[1:])
         finally:
             current.inputs = before
 

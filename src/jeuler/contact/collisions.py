@@ -18,6 +18,8 @@ from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.contact.contacts import Contacts
 from jeuler.contact.within_step import answer, resolve
 
+FEW_PAIRS = 32  # of them, XLA's faster loops do not pay for their compilation
+
 
 @component(static=("pairs", "max_bounces"), positive=("radius", "restitution", "friction"))
 class Collisions:
@@ -109,6 +111,11 @@ class Collisions:
     @property
     def writes(self) -> tuple[str, ...]:
         return ("unresolved_contacts",)
+
+    @property
+    def is_long_code(self) -> bool:
+        """Whether compiling a run takes longer than it runs: contacts that may be several at once, and not many."""
+        return (len(self.colliders) > 1 or len(self.pairs) > 0) and len(self.pairs) <= FEW_PAIRS
 
     def _rounds(self) -> int:
         if self.max_bounces is not None:

@@ -259,17 +259,20 @@ def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: 
     empty = Events(none, jnp.zeros_like(path.s), no, no)
     record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds + 1, *x.shape)), empty)
 
+    def play(path, found, k):
+        events = choose(contacts, found)
+        events = events._replace(plastic=events.plastic | (k == rounds))
+        return strike(contacts, path, events, found.s, found.look, theta), events
+
     def one(state):
         path, record, k, _, left = state
         found = next_impacts(contacts, path, slow)
-        events = choose(contacts, found)
-        events = events._replace(plastic=events.plastic | (k == rounds))
-        any_left = jnp.any(events.contact >= 0)
-        stopped = (k == rounds) & jnp.isfinite(found.s) & ~found.plastic
+        happens = jnp.isfinite(found.s)
+        stopped = (k == rounds) & happens & ~found.plastic
         left = left + jnp.sum(found.unclear | stopped).astype(jnp.int32)
+        path, events = lax.cond(anywhere(happens), play, lambda path, *_: (path, empty), path, found, k)
         record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)
-        path = strike(contacts, path, events, found.s, found.look, theta)
-        return path, record, k + 1, any_left, left
+        return path, record, k + 1, jnp.any(happens), left
 
     def go_on(state):
         _, _, k, any_left, _ = state

@@ -15,6 +15,7 @@ from jeuler._core.component import Function, replace
 from jeuler._core.components import per_particle
 from jeuler._core.limits import check_parameters
 from jeuler._jax import programs
+from jeuler._jax.haste import Haste
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import START, acts, draws, name_of, needs, with_required_fields
 from jeuler.particles.protocols import Context
@@ -104,7 +105,12 @@ def simulate(
     if resume is not None:
         return Solution(*run_on_disk(_loop, inputs, settings, grid, resume, checkpoint_every, progress))
     found = run_in_chunks(_loop, inputs, settings, grid, progress)
-    return programs.call(_simulate, inputs, settings) if found is None else Solution(*found)
+    return programs.call(_simulate, inputs, settings, _haste(scene)) if found is None else Solution(*found)
+
+
+def _haste(scene: Scene) -> Haste:
+    """A program of few contacts is small work and long code."""
+    return "some" if any(getattr(effect, "is_long_code", False) for effect in scene.effects) else "none"
 
 
 def _simulate(*given: Any) -> Solution:
