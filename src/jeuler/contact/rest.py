@@ -67,11 +67,13 @@ class Problem(NamedTuple):
         """The impulse nearest to y that pushes, and rubs no more than friction can."""
         y_n = self.push(y)[:, None]
         push = jnp.where(self.active[:, None] & (y_n > 0), y_n, 0)
+        weak = push <= self.weak()  # which derivative a rounding has is chance: it may be another one if recomputed
+        push = jnp.where(weak, lax.stop_gradient(push), push)
         y_t = y - y_n * self.normal
         size, most = length(y_t)[:, None], self.contacts.friction * push
         held = size < most  # strictly: friction 0 holds nothing
         rubbed = jnp.where(held, y_t, y_t * (most / jnp.where(held | (size == 0), 1, size)))
-        rubbed = jnp.where(push > self.weak(), rubbed, lax.stop_gradient(rubbed))  # a push of rounding holds nothing
+        rubbed = jnp.where(weak, lax.stop_gradient(rubbed), rubbed)  # nor does it hold anything
         return push * self.normal + rubbed
 
     def weak(self) -> Array:

@@ -51,7 +51,7 @@ def _resolve(
     contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, load: Array | None
 ) -> tuple[Array, Array, Array]:
     displacement, dv = x_free - x, v_free - v
-    theta = share_of_the_force(displacement, v, dv, contacts.dt)
+    theta = share_of_the_force(x, displacement, v, dv, contacts.dt)
     contacts.near(free_path(x, displacement, dv, contacts.dt))
     slow = _slow(contacts, dv)
 
