@@ -114,7 +114,7 @@ def next_steps(found: SpringFit) -> Iterator[str]:
     if "use dt" in found.message:
         yield "The step of the simulation is felt in the numbers: fit again with the smaller dt named above."
     if found.stderr is None:
-        yield "No errors were found, as the Jacobian would be too large: fit a part of the parameters to have theirs."
+        yield "There are too many unknowns for all errors: found.standard_error(name) gives those that you ask for."
     yield "Test the parameters on a recording that was not fitted: the residual there is the one that counts."
 
 
