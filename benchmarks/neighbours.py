@@ -30,7 +30,7 @@ def start(particles):
 
 
 def ours(x, v, box, steps):
-    near = jeuler.Neighbours(S, SKIN, capacity=40, cell_capacity=16, box=[box] * 3)
+    near = jeuler.Neighbours(S, SKIN, capacity=40, box=[box] * 3)
     scene = jeuler.Scene((jeuler.SoftRepulsion(near, S, ks=EPS / S**2),), (near,))
 
     @jax.jit
