@@ -94,9 +94,52 @@ def select(recordings: list[Recording], arguments: Any) -> Measurement:
 
 def _one(recording: Recording, arguments: Any) -> Measurement:
     columns, quantity, dim, left_out = choose_columns(recording, arguments)
-    warnings = []
-    begin, end = arguments.begin, arguments.end
-    times = recording.times
+    keep = _rows_kept(recording, arguments)
+    values = recording.values[:, [recording.columns.index(column) for column in columns]][keep]
+    _check_sizes(recording, columns, values)
+    warnings = [*_unit_words(columns), *_size_words(columns, quantity, values)]
+    unknown = any(np.isnan(column.factor) for column in columns)
+    alike = [column for column in columns if column.quantity and column.quantity not in OBSERVED]
+    unit = columns[0].unit if unknown else columns[0].si if alike else UNITS[quantity]
+    notes = recording.notes
+    if alike:
+        notes = (
+            *notes,
+            f"{listed([c.name for c in alike])}: a {alike[0].quantity}, fitted as if it were a position, whose "
+            f"frequency and decay it has: ks and kd are right, amplitudes are in {unit or 'its own unit'}.",
+        )
+    measured = Measurement(
+        drive=_drive(recording, arguments, columns, keep),
+        moves_support=arguments.support is not None,
+        source=recording.source,
+        run=recording.run,
+        clock=recording.clock.name,
+        times=recording.times[keep],
+        positions=values.reshape(len(values), -1, dim),
+        names=[column.name for column in columns],
+        quantity=quantity,
+        unit=unit,
+        left_out=(*recording.left_out, *left_out),
+        notes=notes,
+        warnings=(*recording.warnings, *warnings),
+    )
+    clock = sampling(measured.times)
+    driven: tuple[str, ...] = ()
+    if measured.drive is not None:
+        driven = (f"{arguments.input} is the measured force u(t).",)
+        if arguments.support is not None:
+            driven = (f"{arguments.support} is the measured position s(t) of the support.",)
+    gaps = (
+        (f"The record has {counted(clock.gaps, 'gap')}, the longest of {clock.longest_gap:.3g} s.",)
+        if clock.gaps
+        else ()
+    )
+    return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *driven, *gaps)))
+
+
+def _rows_kept(recording: Recording, arguments: Any) -> np.ndarray:
+    """Which rows are between --from and --to: enough of them, over a time that can be one in seconds."""
+    begin, end, times = arguments.begin, arguments.end, recording.times
     keep = np.ones(len(times), bool)
     keep &= times >= begin if begin is not None else True
     keep &= times <= end if end is not None else True
@@ -112,8 +155,11 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
             f"{span:g} s, expected {SPANS[0]:g} to {SPANS[1]:g} s; say which column is the time with --time, and its "
             f"unit with --unit"
         )
-    places = [recording.columns.index(column) for column in columns]
-    values = recording.values[:, places][keep]
+    return keep
+
+
+def _check_sizes(recording: Recording, columns: list[Column], values: np.ndarray) -> None:
+    """No column moves by less than a number in SI units can tell from nothing."""
     for column, given in zip(columns, values.T, strict=True):
         seen = given[np.isfinite(given)]
         if len(seen) and 0 < np.ptp(seen) < SMALLEST:
@@ -121,56 +167,24 @@ def _one(recording: Recording, arguments: Any) -> Measurement:
                 f"{recording.source}: column {column.index + 1} ({column.name[:60]}): moves by {np.ptp(seen):g} "
                 f"{column.si}, less than can be told from nothing; say its unit with --unit"
             )
+
+
+def _unit_words(columns: list[Column]) -> list[str]:
+    """Warnings where a unit has no known scale, or nothing says what a column is."""
+    words = []
     unknown = [column.name for column in columns if np.isnan(column.factor)]
     if unknown:
-        warnings.append(
+        words.append(
             f"The unit of {listed(unknown)} has no known scale: positions are in {columns[0].unit}; "
             f"ks and kd are right, as they do not depend on it, but forces and amplitudes are not in SI units."
         )
     untold = [column.name for column in columns if not column.told]
     if untold:
-        warnings.append(
+        words.append(
             f"Neither name nor unit says what {listed(untold)} is: taken as a position in m. "
             f"Correct it with --observe or --unit."
         )
-    alike = [column for column in columns if column.quantity and column.quantity not in OBSERVED]
-    unit = columns[0].unit if unknown else columns[0].si if alike else UNITS[quantity]
-    notes = recording.notes
-    if alike:
-        notes = (
-            *notes,
-            f"{listed([c.name for c in alike])}: a {alike[0].quantity}, fitted as if it were a position, whose "
-            f"frequency and decay it has: ks and kd are right, amplitudes are in {unit or 'its own unit'}.",
-        )
-    warnings += _size_words(columns, quantity, values)
-    drive = _drive(recording, arguments, columns, keep)
-    measured = Measurement(
-        drive=drive,
-        moves_support=arguments.support is not None,
-        source=recording.source,
-        run=recording.run,
-        clock=recording.clock.name,
-        times=times[keep],
-        positions=values.reshape(len(values), -1, dim),
-        names=[column.name for column in columns],
-        quantity=quantity,
-        unit=unit,
-        left_out=(*recording.left_out, *left_out),
-        notes=notes,
-        warnings=(*recording.warnings, *warnings),
-    )
-    clock = sampling(measured.times)
-    driven: tuple[str, ...] = ()
-    if drive is not None:
-        driven = (f"{arguments.input} is the measured force u(t).",)
-        if arguments.support is not None:
-            driven = (f"{arguments.support} is the measured position s(t) of the support.",)
-    gaps = (
-        (f"The record has {counted(clock.gaps, 'gap')}, the longest of {clock.longest_gap:.3g} s.",)
-        if clock.gaps
-        else ()
-    )
-    return thinned(dataclasses.replace(measured, sampling=clock, notes=(*measured.notes, *driven, *gaps)))
+    return words
 
 
 def _size_words(columns: list[Column], quantity: str, values: np.ndarray) -> list[str]:

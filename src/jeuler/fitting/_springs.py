@@ -223,31 +223,39 @@ def fit_springs(
         resume=resume,
         progress=progress,
     )
+    _check_choices(parameters, start, grow, step_bias)
+    records = [Recording(times, positions)] if recordings is None else listed(recordings, times, positions)
+    whole, held = [each.values for each in records], None
+    if held_out is not None:
+        records, held = recordings_without(held_out, records)
+    of_scene: dict[str, Any] = {"dt": dt, "t0": t0, "step": step, "names": parameters, "where": where, "ties": ties}
+    if recordings is None and observe == "position" and not any(name in SENSOR_PARAMETERS for name in parameters):
+        task = Recorded.of(scene, state, times, records[0].values, num_steps=num_steps, **of_scene)
+        found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors, smoothness)
+        return _completed(task, found, begun, step_bias, whole[0], held)
+    if num_steps is not None:
+        raise ValueError("num_steps is for positions alone; leave it out: the run reaches the last time")
+    of_record = {"observe": observe, "bounds": bounds, "sigma": sigma, "weights": weights}
+    of_record |= {"single": recordings is None, "per_recording": per_recording}
+    several = Several.of(scene, state, records, **of_record, **of_scene)
+    found, begun = several.fit(options, start, grow, priors, smoothness)
+    return _completed(several, found, begun, step_bias, whole[0] if recordings is None else whole, held)
+
+
+def _check_choices(parameters: Any, start: Any, grow: Any, step_bias: Any) -> None:
     checks.true_or_false("grow", grow)
     checks.true_or_false("step_bias", step_bias)
     if start not in ("data", "given"):
         raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
     if isinstance(parameters, str):
         raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {parameters!r}')
-    alone = recordings is None
-    records = [Recording(times, positions)] if recordings is None else listed(recordings, times, positions)
-    whole, held = [each.values for each in records], None
-    if held_out is not None:
-        records, held = recordings_without(held_out, records)
-    of_scene: dict[str, Any] = {"dt": dt, "t0": t0, "step": step, "names": parameters, "where": where, "ties": ties}
-    task: Recorded | Several
-    if not alone or observe != "position" or any(name in SENSOR_PARAMETERS for name in parameters):
-        of_record = {"observe": observe, "bounds": bounds, "sigma": sigma, "weights": weights}
-        if num_steps is not None:
-            raise ValueError("num_steps is for positions alone; leave it out: the run reaches the last time")
-        task = Several.of(scene, state, records, single=alone, per_recording=per_recording, **of_record, **of_scene)
-        found, begun = task.fit(options, start, grow, priors, smoothness)
-    else:
-        task = Recorded.of(scene, state, times, records[0].values, num_steps=num_steps, **of_scene)
-        found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors, smoothness)
+
+
+def _completed(task: Recorded | Several, found: Any, begun: str, step_bias: bool, whole: Any, held: Any) -> SpringFit:
+    """What is reported of a fit: with the step's bias, and the residual of the part that was held out."""
     fields, bias, fitted_scene, fitted_state, predicted = task.completed(found, step_bias)
     if held is not None and not task.traced:
-        task = task.seen_whole(whole[0] if alone else whole)
+        task = task.seen_whole(whole)
         fields |= judged(task.series_of_each(predicted), held, fields["message"])
     complete = SpringFit(
         ks=values_of_springs(fitted_scene, "ks"),
