@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from cases import EFFECTS, FORCES, net_state
+from cases import EFFECTS, FORCES, NET_EDGES, net_state
 
 import jeuler
 from jeuler._core.component import component
@@ -194,6 +194,13 @@ SCENES = {
     ),
     "contact": HookScene((GRAVITY,), builtin=("sampled_motion", "collisions")),
     "pairs": HookScene((SPRINGS,), builtin=("colliding_pairs",)),
+    "links": HookScene((SPRINGS, GRAVITY), builtin=("distance_links",)),
+    "springs that break": HookScene(
+        (jeuler.BreakableSprings(NET_EDGES, 30.0, 0.7, 0.9), GRAVITY), builtin=("breaking",)
+    ),
+    "those near": HookScene(
+        (jeuler.SoftRepulsion(EFFECTS["neighbours"].make(), 0.9, 20.0, 0.5), GRAVITY), builtin=("neighbours",)
+    ),
     "births": HookScene(
         (SPRINGS, AmongTheLiving(), WINDY),
         (jeuler.Emitter(10.0, Corner(), [0.1, 0.2], max_births=1), Counts()),

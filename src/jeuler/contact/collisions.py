@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -130,6 +130,11 @@ class Collisions:
             checks.shape(f"Collisions.{name}", getattr(self, name).shape, *shapes)
         for collider in self.colliders:
             check_collider(collider, dim)
+
+
+def has_long_code(effects: Sequence[Any]) -> bool:
+    """Whether a run with these effects takes longer to compile than to run, by its contacts."""
+    return any(effect.is_long_code for effect in effects if isinstance(effect, Collisions))
 
 
 def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:

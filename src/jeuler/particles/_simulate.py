@@ -16,6 +16,7 @@ from jeuler._core.components import per_particle
 from jeuler._core.limits import check_parameters
 from jeuler._jax import programs
 from jeuler._jax.haste import Haste
+from jeuler.contact.collisions import has_long_code
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import START, acts, draws, name_of, needs, with_required_fields
 from jeuler.particles.protocols import Context
@@ -110,7 +111,7 @@ def simulate(
 
 def _haste(scene: Scene) -> Haste:
     """A program of few contacts is small work and long code."""
-    return "some" if any(getattr(effect, "is_long_code", False) for effect in scene.effects) else "none"
+    return "some" if has_long_code(scene.effects) else "none"
 
 
 def _simulate(*given: Any) -> Solution:
