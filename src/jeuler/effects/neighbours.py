@@ -31,23 +31,23 @@ class Neighbours:
     right one. Under ``jax.vmap`` rows are made at each step.
 
     Args:
-        cutoff: (), m, the distance up to which forces act.
-        skin: (), m, how far beyond that rows reach: more makes rows longer, and seldom made.
-        capacity: the most neighbours of a particle, within cutoff + skin, an integer. Static.
-        cell_capacity: the most particles in a cell of side cutoff + skin; None takes capacity / 2 + 4. Static.
-        box: (dim,), m, the sides of periodic space, each at least 3 (cutoff + skin); None for free space.
-      Returns: called as an effect ``(t, dt, previous, state, key)``, the state with its rows.
-      Raises: ValueError, if a number is not above 0, or a capacity no integer; in `simulate`, if the box is too small.
-      Example:
-        >>> import jax.numpy as jnp, jeuler
-        >>> near = jeuler.Neighbours(cutoff=1.0, skin=0.2, capacity=4)
-        >>> state = jeuler.ParticleState([[0.0, 0.0], [1.1, 0.0], [3.0, 0.0]], jnp.zeros((3, 2)))
-        >>> end = jeuler.simulate(jeuler.Scene(effects=(near,)), state, dt=0.1, num_steps=1).y
-        >>> end.neighbours[-1].tolist(), end.missed_neighbours[-1].item()
-        ([[-1, 1, -1, -1], [0, -1, -1, -1], [-1, -1, -1, -1]], 0)
+      cutoff: (), m, the distance up to which forces act.
+      skin: (), m, how far beyond that rows reach: more makes rows longer, and seldom made.
+      capacity: the most neighbours of a particle, within cutoff + skin, an integer. Static.
+      cell_capacity: the most particles in a cell of side cutoff + skin; None takes capacity / 2 + 4. Static.
+      box: (dim,), m, the sides of periodic space, each at least 3 (cutoff + skin); None for free space.
+    Returns: called as an effect ``(t, dt, previous, state, key)``, the state with its rows.
+    Raises: ValueError, if a number is not above 0, or a capacity no integer; in `simulate`, if the box is too small.
+    Example:
+      >>> import jax.numpy as jnp, jeuler
+      >>> near = jeuler.Neighbours(cutoff=1.0, skin=0.2, capacity=4)
+      >>> state = jeuler.ParticleState([[0.0, 0.0], [1.1, 0.0], [3.0, 0.0]], jnp.zeros((3, 2)))
+      >>> end = jeuler.simulate(jeuler.Scene(effects=(near,)), state, dt=0.1, num_steps=1).y
+      >>> end.neighbours[-1].tolist(), end.missed_neighbours[-1].item()
+      ([[-1, 1, -1, -1], [0, -1, -1, -1], [-1, -1, -1, -1]], 0)
 
-      Source: L. Verlet, Computer Experiments on Classical Fluids I, Phys. Rev. 159, 1967 (rows and skin); M. P. Allen,
-        D. J. Tildesley, Computer Simulation of Liquids, 2017, sect. 5.3.
+    Source: L. Verlet, Computer Experiments on Classical Fluids I, Phys. Rev. 159, 1967 (rows and skin); M. P. Allen,
+      D. J. Tildesley, Computer Simulation of Liquids, 2017, sect. 5.3.
     """
 
     cutoff: Parameter
