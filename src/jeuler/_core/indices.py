@@ -48,3 +48,12 @@ def different_particles(name: str, given: Any) -> Indices:
         raise ValueError(f"{name} must have shape (particle,), got {indices.shape}")
     checks.different(name, indices.indices, "particles")
     return indices
+
+
+def particle_groups(name: str, given: Any, count: int, group: str, meaning: str) -> Indices:
+    """The indices of groups of different particles, so many in each, (group, count)."""
+    indices = Indices(given, name, f"integers of shape ({group}, {count}), particle indices")
+    if len(indices.shape) != 2 or indices.shape[1] != count:
+        raise ValueError(f"{name} must be integers of shape ({group}, {count}), got {indices.shape}")
+    checks.different(name, indices.indices, f"particles, {meaning}")
+    return indices

@@ -5,21 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices
-from jeuler._core.component import component, replace, store_as_float
-from jeuler._core.components import split, stack
+from jeuler._core.component import component, store_as_float
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction
+from jeuler.forces.prepared import PreparedLinks
 from jeuler.forces.springs import coefficient
-from jeuler.graphs.layouts import Layout
-from jeuler.graphs.topology import Topology
-
-STRENGTHS = ("ks", "kd", "cubic")  # what a link without one of its ends has not
+from jeuler.graphs.topology import topology
 
 
 def cubic_coefficient(square: Array, approach: Array, ks: Array, kd: Array, rest_length: Array, cubic: Array) -> Array:
@@ -37,46 +33,6 @@ def string_coefficient(square: Array, approach: Array, ks: Array, kd: Array, res
     return jnp.where(long & (r > rest_length) & (tension > 0), -tension / r, 0)
 
 
-@component(static=("edges", "layouts", "law", "names", "read_again"))
-class PreparedLinks:
-    """Links as the kernels take them, with the parameters in the slots of each layout."""
-
-    edges: Topology
-    layouts: tuple[Layout, ...]
-    law: Callable[..., Array]
-    names: tuple[str, ...]
-    read_again: bool  # see `Layout.central_force`
-    parameters: Any  # of each name, what `Layout.to_slots` made of it
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, broken: Array | None = None) -> Array:
-        if broken is not None:
-            checks.shape("state.broken", broken.shape, (1, len(self.edges)), meaning="one a spring; see Breaking")
-            return self.only(~broken[0])(t, position, velocity, mass)
-        x, v = split(position), split(velocity)
-        total = [jnp.zeros_like(component) for component in x]
-        for layout, *parameters in zip(self.layouts, *self.parameters, strict=True):
-            shares = layout.central_force(self.law, x, v, parameters, self.read_again)
-            total = [a + b for a, b in zip(total, shares, strict=True)]
-        return stack(total)
-
-    def prepare(self, context: Any) -> PreparedLinks:
-        """Between the living only."""
-        return self if context.alive is None else self.only(jnp.all(context.alive[self.edges[:]], axis=1))
-
-    def only(self, which: Array) -> PreparedLinks:
-        """These links only, (link,) boolean."""
-        here = [layout.to_slots(which) for layout in self.layouts]
-
-        def only_here(name, parameter):
-            if name not in STRENGTHS:
-                return parameter
-            groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
-            return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
-
-        pairs = zip(self.names, self.parameters, strict=True)
-        return replace(self, parameters=[only_here(name, parameter) for name, parameter in pairs])
-
-
 class _Links:
     """What the links share."""
 
@@ -84,9 +40,10 @@ class _Links:
     rest_length: Any
     law: ClassVar[Callable[..., Array]]
     names: ClassVar[tuple[str, ...]] = ("ks", "kd", "rest_length")
+    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "edges", Topology(self.edges))
+        object.__setattr__(self, "edges", topology(self.edges))
         store_as_float(self, *self.names)
 
     def prepare(self, context: Any) -> PreparedLinks | None:
@@ -113,8 +70,15 @@ class _Links:
         return r[:, 0] - self.rest_length.astype(position.dtype)
 
 
+class _LastingLinks(_Links):
+    """Links that no state breaks."""
+
+    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
+        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
+
+
 @component(static=("edges",), positive=("ks", "kd", "rest_length"))
-class CubicSprings(_Links):
+class CubicSprings(_LastingLinks):
     """Springs that grow stiffer, or softer, as they are stretched (Duffing's), with dampers.
 
         s = r - L,   F_i = -(ks s + cubic s^3) u - kd ((v_i - v_j).u) u,   F_j = -F_i
@@ -145,12 +109,7 @@ class CubicSprings(_Links):
 
     law: ClassVar[Callable[..., Array]] = staticmethod(cubic_coefficient)
     names: ClassVar[tuple[str, ...]] = ("ks", "kd", "rest_length", "cubic")
-    limits: ClassVar[dict[str, Any]] = {
-        "ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m"), "cubic": ("", "N/m^3"),
-    }  # fmt: skip
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
+    limits: ClassVar[dict[str, Any]] = {**_Links.limits, "cubic": ("", "N/m^3")}
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks s^2 / 2 + cubic s^4 / 4, J."""
@@ -159,7 +118,7 @@ class CubicSprings(_Links):
 
 
 @component(static=("edges",), positive=("ks", "kd", "rest_length"))
-class Strings(_Links):
+class Strings(_LastingLinks):
     """Strings: they pull where they are longer than their rest length, and are slack where they are shorter.
 
         T = ks (r - L) + kd (v_i - v_j).u   where r > L and T > 0, else 0;   F_i = -T u,   F_j = -F_i
@@ -187,10 +146,6 @@ class Strings(_Links):
     rest_length: Parameter
 
     law: ClassVar[Callable[..., Array]] = staticmethod(string_coefficient)
-    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy of the strings that are taut, sum ks (r - L)^2 / 2, J."""
@@ -229,7 +184,6 @@ class BreakableSprings(_Links):
     rest_length: Parameter
 
     law: ClassVar[Callable[..., Array]] = staticmethod(coefficient)
-    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
     reads: ClassVar[tuple[str, ...]] = ("broken",)
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, broken: Array) -> Array:

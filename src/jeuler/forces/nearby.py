@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -65,6 +66,21 @@ class _Nearby:
     def check(self, particles: int, dim: int) -> None:
         self.neighbours.check(particles, dim)
 
+    def __call__(
+        self,
+        t: Any,
+        position: Array,
+        velocity: Array,
+        mass: Array,
+        neighbours: Array,
+        has_neighbours: Array | None = None,
+    ) -> Array:
+        """The sum of what the neighbours exert; NaN where rows were never made."""
+        pairs = self._pairs(position, neighbours, has_neighbours)
+        shares = self._shares(pairs, position, split(velocity), mass)
+        total = stack([pairs.sum(share) for share in shares])
+        return jnp.where(neighbours[:, :1] == NOT_BUILT, jnp.nan, total)
+
     def _pairs(self, position: Array, rows: Array, made: Array | None) -> Pairs:
         dtype, x = position.dtype, split(position)
         box = self.neighbours.box
@@ -81,10 +97,9 @@ class _Nearby:
                 here = here & made[who] & made[:, None]
         return Pairs(who, here, d, jnp.sqrt(jnp.where(here, square, 1)))
 
-    def _force(self, pairs: Pairs, shares: list[Array], rows: Array) -> Array:
-        """The sum of these shares; NaN where rows were never made."""
-        total = stack([pairs.sum(share) for share in shares])
-        return jnp.where(rows[:, :1] == NOT_BUILT, jnp.nan, total)
+    def _shares(self, pairs: Pairs, position: Array, v: Sequence[Array], mass: Array) -> list[Array]:
+        """What each neighbour exerts, (particle, capacity) for each component."""
+        raise NotImplementedError
 
 
 @component(static=(), parameters=("diameter", "ks", "kd"), positive=("diameter", "ks", "kd"))
@@ -127,22 +142,12 @@ class SoftRepulsion(_Nearby):
     def __post_init__(self) -> None:
         self._store("diameter", "ks", "kd")
 
-    def __call__(
-        self,
-        t: Any,
-        position: Array,
-        velocity: Array,
-        mass: Array,
-        neighbours: Array,
-        has_neighbours: Array | None = None,
-    ) -> Array:
-        pairs = self._pairs(position, neighbours, has_neighbours)
+    def _shares(self, pairs: Pairs, position: Array, v: Sequence[Array], mass: Array) -> list[Array]:
         s, ks, kd = (x.astype(position.dtype) for x in (self.diameter, self.ks, self.kd))
         overlap = jnp.maximum(s - pairs.r, 0)
-        v = split(velocity)
         approach = dot([a[:, None] - b for a, b in zip(v, pairs.of(v), strict=True)], pairs.d) / pairs.r
         c = overlap * (ks - kd / s * approach) / pairs.r
-        return self._force(pairs, [c * one for one in pairs.d], neighbours)
+        return [c * one for one in pairs.d]
 
     def check(self, particles: int, dim: int) -> None:
         self.neighbours.check(particles, dim)
@@ -197,16 +202,7 @@ class Flocking(_Nearby):
     def __post_init__(self) -> None:
         self._store("separation", "alignment", "cohesion")
 
-    def __call__(
-        self,
-        t: Any,
-        position: Array,
-        velocity: Array,
-        mass: Array,
-        neighbours: Array,
-        has_neighbours: Array | None = None,
-    ) -> Array:
-        pairs, v = self._pairs(position, neighbours, has_neighbours), split(velocity)
+    def _shares(self, pairs: Pairs, position: Array, v: Sequence[Array], mass: Array) -> list[Array]:
         a, b, c = (x.astype(position.dtype) for x in (self.separation, self.alignment, self.cohesion))
         reach = self.neighbours.cutoff.astype(position.dtype)
         square = pairs.r**2
@@ -214,7 +210,7 @@ class Flocking(_Nearby):
         along = w * (a * reach / square - c)
         share = mass_that_feels(mass) / (0.01 + pairs.sum(w))
         shares = [along * d + b * w * (vj - vi[:, None]) for d, vi, vj in zip(pairs.d, v, pairs.of(v), strict=True)]
-        return self._force(pairs, [share[:, None] * one for one in shares], neighbours)
+        return [share[:, None] * one for one in shares]
 
 
 @component(
@@ -278,17 +274,8 @@ class Fluid(_Nearby):
         kernel = jnp.where(pairs.here, (1 - (pairs.r / reach) ** 2) ** 3, 0)
         return self.mass.astype(position.dtype) * (1 + jnp.sum(kernel, axis=1)) * KERNEL[dim] / reach**dim
 
-    def __call__(
-        self,
-        t: Any,
-        position: Array,
-        velocity: Array,
-        mass: Array,
-        neighbours: Array,
-        has_neighbours: Array | None = None,
-    ) -> Array:
+    def _shares(self, pairs: Pairs, position: Array, v: Sequence[Array], mass: Array) -> list[Array]:
         dtype, dim = position.dtype, position.shape[1]
-        pairs, v = self._pairs(position, neighbours, has_neighbours), split(velocity)
         m, rest, stiffness, viscosity = (
             x.astype(dtype) for x in (self.mass, self.density, self.stiffness, self.viscosity)
         )
@@ -299,8 +286,7 @@ class Fluid(_Nearby):
         falls = 6 * KERNEL[dim] / reach ** (dim + 2) * (1 - (pairs.r / reach) ** 2) ** 2  # -W'(r) / r
         push = m**2 * falls * (pressure[:, None] + pressure_j)
         drag = 2 * m**2 * viscosity * falls / (rho[:, None] * rho_j)
-        shares = [push * d + drag * (vj - vi[:, None]) for d, vi, vj in zip(pairs.d, v, pairs.of(v), strict=True)]
-        return self._force(pairs, shares, neighbours)
+        return [push * d + drag * (vj - vi[:, None]) for d, vi, vj in zip(pairs.d, v, pairs.of(v), strict=True)]
 
 
 KERNEL = {1: 35 / 32, 2: 4 / np.pi, 3: 315 / (64 * np.pi)}  # 1 / integral of (1 - r^2)^3 over the unit ball

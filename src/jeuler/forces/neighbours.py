@@ -11,7 +11,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices, default
 from jeuler._core.component import component, replace, store_as_float
-from jeuler._core.indices import Indices
+from jeuler._core.indices import particle_groups
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
 from jeuler.graphs.topology import topology
@@ -106,10 +106,7 @@ class Bending:
     limits: ClassVar[dict[str, Any]] = {"stiffness": (">= 0", "N m/rad^2"), "rest_angle": ("", "rad")}
 
     def __post_init__(self) -> None:
-        triples = Indices(self.triples, "Bending.triples", "integers of shape (triple, 3), particle indices")
-        if len(triples.shape) != 2 or triples.shape[1] != 3:
-            raise ValueError(f"Bending.triples must be integers of shape (triple, 3), got {triples.shape}")
-        checks.different("Bending.triples", triples.indices, "particles, (i, j, k) with j in the middle")
+        triples = particle_groups("Bending.triples", self.triples, 3, "triple", "(i, j, k) with j in the middle")
         object.__setattr__(self, "triples", triples)
         store_as_float(self, "stiffness", "rest_angle")
         check_limits(self)

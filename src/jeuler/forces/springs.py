@@ -11,13 +11,13 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import MovingParameter, ParticleIndices
 from jeuler._core.component import component, replace, store_as_float
-from jeuler._core.components import per_particle, split, stack
+from jeuler._core.components import per_particle
 from jeuler._core.in_time import at_time, moving
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
-from jeuler.graphs.layouts import Layout
-from jeuler.graphs.topology import Topology, topology
+from jeuler.forces.prepared import PreparedLinks
+from jeuler.graphs.topology import topology
 
 
 @jax.custom_jvp
@@ -119,7 +119,7 @@ class Springs:
             return self
         return replace(self, **{name: at_time(getattr(self, name), t, dtype) for name in PARAMETERS})
 
-    def prepare(self, context: Any) -> PreparedSprings | MovingSprings | None:
+    def prepare(self, context: Any) -> PreparedLinks | MovingSprings | None:
         """The springs between the living, laid out for the kernels; None where there are no springs."""
         if not len(self.edges):
             return None
@@ -127,12 +127,12 @@ class Springs:
             return MovingSprings(self, context.limits_drag, context.alive)
         return self.laid_out(context.particles, context.dtype, context.limits_drag).prepare(context)
 
-    def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedSprings:
+    def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedLinks:
         """The same force with its parameters in the slots of each layout, which is the same work at every step."""
         layouts = self.edges.layouts(particles)
-        parameters = (x.astype(dtype) for x in (self.ks, self.kd, self.rest_length))
-        slots = ([layout.to_slots(x) for layout in layouts] for x in parameters)
-        return PreparedSprings(self.edges, layouts, read_again, *slots)
+        values = [getattr(self, name).astype(dtype) for name in PARAMETERS]
+        slots = [[layout.to_slots(x) for layout in layouts] for x in values]
+        return PreparedLinks(self.edges, layouts, coefficient, PARAMETERS, read_again, slots)
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks (r - L)^2 / 2, J."""
@@ -184,42 +184,6 @@ class Springs:
             shape = (checks.form_of(f"Springs.{name}", at_time, value, 0.0) if callable(value) else value).shape
             checks.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
         check_limits(self)
-
-
-@component(static=("edges", "layouts", "read_again"))
-class PreparedSprings:
-    """Springs as the kernels take them, with the parameters in the slots of each layout."""
-
-    edges: Topology
-    layouts: tuple[Layout, ...]
-    read_again: bool  # see `Layout.central_force`
-    ks: Any
-    kd: Any
-    rest_length: Any
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        x, v = split(position), split(velocity)
-        total = [jnp.zeros_like(component) for component in x]
-        for layout, *parameters in zip(self.layouts, self.ks, self.kd, self.rest_length, strict=True):
-            shares = layout.central_force(coefficient, x, v, parameters, self.read_again)
-            total = [a + b for a, b in zip(total, shares, strict=True)]
-        return stack(total)
-
-    def prepare(self, context: Any) -> PreparedSprings:
-        """Between the living only: a spring with a dead end has no stiffness and no damping."""
-        if context.alive is None:
-            return self
-        return self.only(jnp.all(context.alive[self.edges[:]], axis=1))
-
-    def only(self, which: Array) -> PreparedSprings:
-        """These springs only, (spring,) boolean: the others have no stiffness and no damping."""
-        here = [layout.to_slots(which) for layout in self.layouts]
-
-        def only_here(parameter):
-            groups = [layout.by_group(x) for layout, x in zip(self.layouts, parameter, strict=True)]
-            return jax.tree.map(lambda on, x: jnp.where(on, x, 0), here, groups)
-
-        return replace(self, ks=only_here(self.ks), kd=only_here(self.kd))
 
 
 @component(static=("read_again",))

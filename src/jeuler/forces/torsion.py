@@ -12,7 +12,7 @@ from jax import Array
 from jeuler._core import checks
 from jeuler._core.annotations import Parameter, ParticleIndices, default
 from jeuler._core.component import component, replace, store_as_float
-from jeuler._core.indices import Indices
+from jeuler._core.indices import particle_groups
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart
 from jeuler.forces.neighbours import only_among
@@ -53,10 +53,7 @@ class Torsion:
     limits: ClassVar[dict[str, Any]] = {"stiffness": (">= 0", "N m/rad^2"), "rest_angle": ("", "rad")}
 
     def __post_init__(self) -> None:
-        quads = Indices(self.quads, "Torsion.quads", "integers of shape (quad, 4), particle indices")
-        if len(quads.shape) != 2 or quads.shape[1] != 4:
-            raise ValueError(f"Torsion.quads must be integers of shape (quad, 4), got {quads.shape}")
-        checks.different("Torsion.quads", quads.indices, "particles, (i, j, k, l) with the axis from j to k")
+        quads = particle_groups("Torsion.quads", self.quads, 4, "quad", "(i, j, k, l) with the axis from j to k")
         object.__setattr__(self, "quads", quads)
         store_as_float(self, "stiffness", "rest_angle")
         check_limits(self)
