@@ -13,8 +13,8 @@ from jax import Array
 from jeuler._core.interpolate import hermite
 from jeuler.commands.forces import Driving, DryFriction, Restoring, Samples, SignedQuadraticDrag
 from jeuler.fitting.observations import place_in_steps
+from jeuler.fitting.prediction import motion
 from jeuler.forces import Springs
-from jeuler.particles._simulate import simulate
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import rk4_step
@@ -142,16 +142,8 @@ class Model:
     def motion(self, params: dict[str, Any], dt: float, num_steps: int, t0: float) -> tuple[Array, Array, Array, Scene]:
         """Positions and velocities at the steps, the masses, and the scene."""
         scene, state = self.scene(params)
-        run = simulate(
-            scene,
-            state,
-            dt=dt,
-            num_steps=num_steps,
-            t0=t0,
-            step=rk4_step,
-            save=lambda t, now: (now.position, now.velocity),
-        )
-        return run.y[0], run.y[1], state.mass, scene
+        p, v = motion(scene, state, dt=dt, num_steps=num_steps, t0=t0, step=rk4_step)
+        return p, v, state.mass, scene
 
     def observed(self, params: dict[str, Any], scene: Scene, mass: Array, t: Array, p: Array, v: Array) -> Array:
         """What is observed at states (time, particle, dim) at times (time,)."""

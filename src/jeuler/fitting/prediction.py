@@ -23,6 +23,11 @@ from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step
 
 
+def motion(scene: Scene, state: ParticleState, **how: Any) -> tuple[Array, Array]:
+    """Positions and velocities at the ends of the steps, (step + 1, particle, dim), of a run as `simulate` takes it."""
+    return simulate(scene, state, save=lambda t, now: (now.position, now.velocity), **how).y
+
+
 @dataclasses.dataclass(frozen=True)
 class Prediction:
     """Positions at the times of a recording, and the residual against it. Hashable: programs are kept by it.
@@ -38,16 +43,7 @@ class Prediction:
     def positions(self, params: dict[str, Any], data: dict[str, Any]) -> Array:
         """Positions of all particles at the times, (time, particle, dim), m."""
         scene, state = self.places.put(data["scene"], data["state"], params)
-        run = simulate(
-            scene,
-            state,
-            dt=data["dt"],
-            num_steps=self.num_steps,
-            t0=data["t0"],
-            step=self.step,
-            save=lambda t, now: (now.position, now.velocity),
-        )
-        p, v = run.y
+        p, v = motion(scene, state, dt=data["dt"], num_steps=self.num_steps, t0=data["t0"], step=self.step)
         k, s = data["interval"], data["fraction"].astype(p.dtype)[:, None, None]
         return hermite(s, data["dt"].astype(p.dtype), p[k], p[k + 1], v[k], v[k + 1])
 

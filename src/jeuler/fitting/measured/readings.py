@@ -17,8 +17,8 @@ from jeuler._core.interpolate import hermite
 from jeuler._jax.haste import Haste, jit_in_haste
 from jeuler.fitting.forward import MEDIUM, SMALL, in_a_loop
 from jeuler.fitting.parameters import Places
+from jeuler.fitting.prediction import motion
 from jeuler.observing import Sensor
-from jeuler.particles._simulate import simulate
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step
@@ -99,17 +99,9 @@ class Readings:
         """The readings of one recording, (time, ...)."""
         scene, state = self.places.put(data["scene"], data["state"], params)
         sensor = replace(data["sensor"], **{name: params[name] for name in self.of_sensor})
-        dt, t0 = data["dt"], data["t0"]
-        run = simulate(
-            scene,
-            state,
-            dt=dt,
-            num_steps=num_steps,
-            t0=t0,
-            step=in_a_loop(self.step),
-            save=lambda t, now: (now.position, now.velocity),
-        )
-        return read(sensor, scene, state, run.y, data, num_steps)
+        step = in_a_loop(self.step)
+        moved = motion(scene, state, dt=data["dt"], num_steps=num_steps, t0=data["t0"], step=step)
+        return read(sensor, scene, state, moved, data, num_steps)
 
     def __call__(self, params: dict[str, Any], data: Sequence[dict[str, Any]]) -> tuple[Array, ...]:
         """Reading minus measurement where something was observed, 0 elsewhere, (time, column), of each recording."""
