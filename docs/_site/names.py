@@ -5,6 +5,7 @@ A public name without a docstring or without an example is a warning, and so fai
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import pathlib
@@ -37,6 +38,7 @@ PARTS = {  # the order in which a reader needs them
 WITH_METHODS = "solving", "particles", "fitting", "accuracy", "diagnosis", "plotting"
 
 
+@functools.cache
 def public_names() -> dict[str, dict[str, Any]]:
     """The public objects of each part, by the name under which a user finds them."""
     found: dict[str, dict[str, Any]] = {part: {} for part in PARTS}

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 
 import jeuler
 
@@ -132,7 +133,6 @@ def test_a_full_disk_is_told_and_the_last_state_stays(tmp_path):
 
 
 def test_frames_can_be_read_by_others(tmp_path):
-    xarray = pytest.importorskip("xarray")
     run = circle(20, resume=tmp_path / "run", save=lambda t, y: {"position": y[0], "both": jnp.stack(y)})
     frames = xarray.open_zarr(tmp_path / "run" / "frames.zarr", consolidated=False)
     np.testing.assert_array_equal(frames.position, np.asarray(run.y["position"]))

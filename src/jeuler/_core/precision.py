@@ -14,12 +14,7 @@ PyTree = Any
 
 def precision(dtype: Any) -> AbstractContextManager:
     """A context whose default floating dtype is ``dtype``, float32 or float64."""
-    double = np.dtype(dtype) == np.float64
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(double)
-    from jax.experimental import enable_x64  # type: ignore[attr-defined]  # its place before jax 0.8
-
-    return enable_x64(double)
+    return jax.enable_x64(np.dtype(dtype) == np.float64)
 
 
 def setting(name: str) -> Any:

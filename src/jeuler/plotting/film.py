@@ -101,13 +101,12 @@ class Film:
                     f"writing {path.name} needs the program ffmpeg, which is not on the PATH; install it or "
                     f"'jeuler[plot]', or write {path.with_suffix('.gif').name} or {path.with_suffix('.html').name}"
                 )
-            return animation.FFMpegWriter(fps=self.fps)
+            return Mp4Writer(fps=self.fps)
         raise ValueError(f"the film's path must end in .gif, .mp4 or .html, got {path.name!r}")
 
     def write(self, path: Any, writer: Any) -> None:
         figure, pictures = self._draw_all()
-        program = ffmpeg() or "ffmpeg"
-        with matplotlib.rc_context({"animation.ffmpeg_path": program}), writer.saving(figure, str(path), dpi=self.dpi):
+        with writer.saving(figure, str(path), dpi=self.dpi):
             for _ in pictures:
                 writer.grab_frame(facecolor=self.look.background)
         plt.close(figure)
@@ -155,6 +154,14 @@ def ffmpeg() -> str | None:
     except ImportError:
         return None
     return str(imageio_ffmpeg.get_ffmpeg_exe())
+
+
+class Mp4Writer(animation.FFMpegWriter):
+    """Matplotlib's writer of MP4, by the program that `ffmpeg` finds."""
+
+    @classmethod
+    def bin_path(cls) -> str:
+        return ffmpeg() or super().bin_path()
 
 
 class GifWriter(animation.PillowWriter):
