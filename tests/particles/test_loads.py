@@ -98,3 +98,19 @@ def test_a_state_with_times_is_refused_with_the_way_to_read_it():
         Scene(WEIGHTS).force(run.t, run.y)
     with pytest.raises(ValueError, match="zeros_like"):
         jeuler.simulate(Scene(WEIGHTS), HANGING.replace(force=jnp.zeros(3)), dt=0.01, num_steps=2)
+
+
+def test_a_damper_is_read_as_its_end_moves_along_a_path():
+    """A hand of infinite mass that is prescribed has a velocity, which a run saves and a damper feels."""
+    springs = jeuler.Springs([[0, 1]], ks=20.0, kd=3.0, rest_length=0.5)
+    scene = Scene((springs,), (jeuler.PrescribedMotion([0], path),))
+    state = jeuler.ParticleState([[0.0, 0.0], [1.0, 0.0]], jnp.zeros((2, 2)), mass=[jnp.inf, 1.0])
+    run = jeuler.simulate(scene, state, dt=0.01, num_steps=20)
+    t, last = run.t[-1], jax.tree.map(lambda x: x[-1], run.y)
+    assert np.linalg.norm(last.velocity[0]) > 0.1
+    d = last.position[1] - last.position[0]
+    pull = -scene.force(t, last)[1] @ d / np.linalg.norm(d)
+    np.testing.assert_allclose(springs.tension(t, last), [pull], rtol=1e-12)
+    np.testing.assert_allclose(jeuler.observing.SpringForce()(t, scene, last), [pull], rtol=1e-12)
+    rate = (last.velocity[1] - last.velocity[0]) @ d / np.linalg.norm(d)
+    np.testing.assert_allclose(springs.damper_power(t, last), [3.0 * rate**2], rtol=1e-12)

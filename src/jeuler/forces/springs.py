@@ -145,6 +145,8 @@ class Springs:
         """The pull of each spring on its ends, damper included: (spring,), N; negative where it pushes.
 
         T = ks (r - L) + kd (v_i - v_j).u
+
+        The velocities are those of the state, as a run saves them: 0 of what is pinned, its own of what is prescribed.
         """
         ks, kd, rest_length, r, rate, here = self._now(t, state)
         return jnp.where(here, ks * (r - rest_length) + kd * rate, 0)
@@ -172,8 +174,7 @@ class Springs:
         dtype = state.position.dtype
         now = self.at(t, dtype)
         r, u = direction(self.edges.difference(state.position))
-        velocity = jnp.where(per_particle(jnp.isinf(state.mass)), 0, state.velocity)
-        rate = jnp.sum(self.edges.difference(velocity) * u, axis=1)
+        rate = jnp.sum(self.edges.difference(state.velocity) * u, axis=1)
         here = True if state.alive is None else jnp.all(state.alive[self.edges[:]], axis=1)
         return now.ks.astype(dtype), now.kd.astype(dtype), now.rest_length.astype(dtype), r[:, 0], rate, here
 

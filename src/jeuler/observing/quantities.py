@@ -12,30 +12,32 @@ from jeuler._core import checks
 from jeuler._core.annotations import OptionalParameter, Parameter, ParticleIndices, default
 from jeuler._core.component import component, store_as_float
 from jeuler._core.indices import Indices, different_particles
-from jeuler._core.vectors import direction, length
+from jeuler._core.vectors import length
 from jeuler.forces.springs import Springs
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
 
-def _rows(observation: Any, x: Array) -> Array:
-    """The values of the particles that are observed."""
-    return x if observation.particles is None else x[observation.particles[:]]
+class _OfParticles:
+    """What is measured of particles, one by one: chosen ones, or all."""
 
+    particles: Any
 
-def _store_particles(observation: Any) -> None:
-    if observation.particles is not None:
-        name = f"{type(observation).__name__}.particles"
-        object.__setattr__(observation, "particles", different_particles(name, observation.particles))
+    def __post_init__(self) -> None:
+        if self.particles is not None:
+            name = f"{type(self).__name__}.particles"
+            object.__setattr__(self, "particles", different_particles(name, self.particles))
 
+    def _rows(self, x: Array) -> Array:
+        return x if self.particles is None else x[self.particles[:]]
 
-def _check_particles(observation: Any, particles: int) -> None:
-    if observation.particles is not None:
-        checks.indices(f"{type(observation).__name__}.particles", observation.particles[:], particles)
+    def check(self, scene: Scene, particles: int, dim: int) -> None:
+        if self.particles is not None:
+            checks.indices(f"{type(self).__name__}.particles", self.particles[:], particles)
 
 
 @component(static=("particles",))
-class Position:
+class Position(_OfParticles):
     """Where particles are.
 
     Args:
@@ -54,18 +56,12 @@ class Position:
     quantity: ClassVar[str] = "position"
     unit: ClassVar[str] = "m"
 
-    def __post_init__(self) -> None:
-        _store_particles(self)
-
     def __call__(self, t: Any, scene: Scene, state: ParticleState) -> Array:
-        return _rows(self, state.position)
-
-    def check(self, scene: Scene, particles: int, dim: int) -> None:
-        _check_particles(self, particles)
+        return self._rows(state.position)
 
 
 @component(static=("particles",))
-class Velocity:
+class Velocity(_OfParticles):
     """How fast particles are.
 
     Args:
@@ -84,18 +80,12 @@ class Velocity:
     quantity: ClassVar[str] = "velocity"
     unit: ClassVar[str] = "m/s"
 
-    def __post_init__(self) -> None:
-        _store_particles(self)
-
     def __call__(self, t: Any, scene: Scene, state: ParticleState) -> Array:
-        return _rows(self, state.velocity)
-
-    def check(self, scene: Scene, particles: int, dim: int) -> None:
-        _check_particles(self, particles)
+        return self._rows(state.velocity)
 
 
 @component(static=("particles",))
-class Acceleration:
+class Acceleration(_OfParticles):
     """What accelerometers on particles read: a phone's, with gravity in it, or with gravity taken off.
 
         a_i = F_i / m_i - gravity
@@ -124,18 +114,18 @@ class Acceleration:
     unit: ClassVar[str] = "m/s^2"
 
     def __post_init__(self) -> None:
-        _store_particles(self)
+        super().__post_init__()
         store_as_float(self, "gravity")
         if self.gravity is not None:
             checks.finite("Acceleration.gravity", self.gravity)
 
     def __call__(self, t: Any, scene: Scene, state: ParticleState) -> Array:
         y, args = (state.position, state.velocity), scene.attributes(state)
-        a = _rows(self, scene.without_effects().vector_field(t, y, args)[1])
+        a = self._rows(scene.without_effects().vector_field(t, y, args)[1])
         return a if self.gravity is None else a - self.gravity.astype(a.dtype)
 
     def check(self, scene: Scene, particles: int, dim: int) -> None:
-        _check_particles(self, particles)
+        super().check(scene, particles, dim)
         if self.gravity is not None:
             checks.shape("Acceleration.gravity", self.gravity.shape, (dim,), meaning="(dim,)")
 
@@ -260,14 +250,7 @@ class SpringForce:
             object.__setattr__(self, "springs", different_particles("SpringForce.springs", self.springs))
 
     def __call__(self, t: Any, scene: Scene, state: ParticleState) -> Array:
-        pulls = []
-        for force in scene.forces:
-            if isinstance(force, Springs):
-                force = force.at(t, state.position.dtype)
-                pairs = np.asarray(force.edges[:])
-                r, u = direction(state.position[pairs[:, 0]] - state.position[pairs[:, 1]])
-                rate = jnp.sum((state.velocity[pairs[:, 0]] - state.velocity[pairs[:, 1]]) * u, axis=1)
-                pulls.append(force.ks * (r[:, 0] - force.rest_length) + force.kd * rate)
+        pulls = [force.tension(t, state) for force in scene.forces if isinstance(force, Springs)]
         all_of_them = jnp.concatenate(pulls)
         return all_of_them if self.springs is None else all_of_them[self.springs[:]]
 
@@ -280,7 +263,7 @@ class SpringForce:
 
 
 @component(static=("particles",))
-class Projection:
+class Projection(_OfParticles):
     """Where particles appear in a camera's picture.
 
         (u w, v w, w) = M (x, y, z, 1)
@@ -310,14 +293,14 @@ class Projection:
     def __post_init__(self) -> None:
         store_as_float(self, "matrix")
         checks.finite("Projection.matrix", self.matrix)
-        _store_particles(self)
+        super().__post_init__()
 
     def __call__(self, t: Any, scene: Scene, state: ParticleState) -> Array:
-        p = _rows(self, state.position)
+        p = self._rows(state.position)
         matrix = self.matrix.astype(p.dtype)
         picture = p @ matrix[:, :-1].T + matrix[:, -1]
         return picture[:, :2] / picture[:, 2:]
 
     def check(self, scene: Scene, particles: int, dim: int) -> None:
-        _check_particles(self, particles)
+        super().check(scene, particles, dim)
         checks.shape("Projection.matrix", self.matrix.shape, (3, dim + 1), meaning="(3, dim + 1)")
