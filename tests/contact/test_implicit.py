@@ -39,6 +39,14 @@ def test_a_stiff_spring_on_the_floor_carries_the_weight(step):
     np.testing.assert_array_equal(run.unresolved_contacts, 0)
 
 
+def test_the_midpoint_rule_holds_the_balls_but_its_stiff_spring_is_not_to_be_read():
+    """As its docstring says: the places are right, the force in the spring is not that of the weight."""
+    run = two_balls(1e8, 0.0, jeuler.implicit_midpoint_step)
+    np.testing.assert_allclose(run.y.position[:, :, 1], np.broadcast_to([0.1, 1.1], (6, 2)), atol=1e-4)
+    force = 1e8 * (1 - (run.y.position[1:, 1, 1] - run.y.position[1:, 0, 1]))
+    assert np.abs(force / G - 1).max() > 1
+
+
 def test_gradient_of_a_spring_at_rest_on_the_floor():
     def height(ks):
         return two_balls(ks, 0.0, IMPLICIT).y.position[-1, 1, 1]

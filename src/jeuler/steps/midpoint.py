@@ -23,7 +23,8 @@ class ImplicitMidpoint:
     It is half a step of implicit Euler, and as much again in the same direction. Quadratic invariants, such as the
     energy of linear springs without dampers, stay as they are at any dt, where implicit Euler takes energy out; what is
     too stiff for dt rings on with the wrong period instead of dying out. Contact at rest is not part of its equation,
-    as it is of `implicit_euler_step`: `Collisions` act after it.
+    as it is of `implicit_euler_step`: `Collisions` act after it, and the force in a stiff spring that stands on a floor
+    is not to be read.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``, of the structure of y.
