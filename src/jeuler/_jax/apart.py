@@ -52,9 +52,7 @@ def apart(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
             try:
                 of_leaves = jax.make_jaxpr(lambda *x: function(*jax.tree.unflatten(structure, x)), return_shape=True)
                 jaxpr, form = of_leaves(*forms)
-            except (
-                Exception
-            ):  # talk by the name of an axis is refused by many errors; others come again from the call below
+            except Exception:  # of many kinds where an axis is talked to by its name; others come again below
                 jaxpr = None
         if jaxpr is None or jaxpr.effects or any(map(is_placed, jaxpr.consts)):
             return function(*operands)
