@@ -16,6 +16,7 @@ from jeuler.plotting.teaching import (
     step_sizes,
     tangent_step,
 )
+from jeuler.plotting.turnable import view
 
 __all__ = [
     "Camera",
@@ -36,6 +37,7 @@ __all__ = [
     "stability_regions",
     "step_sizes",
     "tangent_step",
+    "view",
 ]
 
 

@@ -116,6 +116,26 @@ def colors_of(state: ParticleState) -> np.ndarray:
     return rgba
 
 
+def colliders_of(scene: Any) -> list[Any]:
+    """The solids of a scene's effects and forces."""
+    colliders = [collider for effect in getattr(scene, "effects", ()) for collider in declared(effect, "colliders")]
+    return colliders + [force.collider for force in getattr(scene, "forces", ()) if hasattr(force, "collider")]
+
+
+def springs_of(scene: Any) -> list[Any]:
+    """The springs of a scene and their kin."""
+    return [force for force in getattr(scene, "forces", ()) if hasattr(force, "rest_length")]
+
+
+def color_of_strain(force: Any, position: np.ndarray, t: float) -> np.ndarray:
+    """The colour of each spring by its strain, (spring, 4)."""
+    ends = position[np.asarray(force.edges)]
+    now = force.at(t) if hasattr(force, "at") else force
+    rest = np.broadcast_to(np.asarray(now.rest_length), len(ends))
+    strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / np.where(rest > 0, rest, 1) - 1
+    return STRAIN(np.clip(0.5 + strain / 0.4, 0, 1))
+
+
 @dataclasses.dataclass(frozen=True)
 class AlongLine:
     """A collider of the line, drawn in the plane: all heights are alike."""
@@ -145,10 +165,8 @@ class Picture:
         position = in_plane(frame.position)
         self.dim = position.shape[1]
         view.aim(ax, position, alive_of(frame), t)
-        forces, effects = getattr(scene, "forces", ()), getattr(scene, "effects", ())
-        self.colliders = [collider for effect in effects for collider in declared(effect, "colliders")]
-        self.colliders += [force.collider for force in forces if hasattr(force, "collider")]
-        self.springs = [force for force in forces if hasattr(force, "rest_length")] if look.links else []
+        self.colliders = colliders_of(scene)
+        self.springs = springs_of(scene) if look.links else []
         self.dot_size = DEFAULT_SIZE if not self.springs else 1.5
         if np.shape(frame.position)[1] == 1:
             self.colliders = [AlongLine(collider) for collider in self.colliders]
@@ -217,10 +235,7 @@ class Picture:
         if self.look.links == "color":
             lines.set_color(rgba[edges[seen]].mean(axis=1))
             return
-        now = force.at(t) if hasattr(force, "at") else force
-        rest = np.broadcast_to(np.asarray(now.rest_length), len(edges))[seen]
-        strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / np.where(rest > 0, rest, 1) - 1
-        lines.set_color(STRAIN(np.clip(0.5 + strain / 0.4, 0, 1)))
+        lines.set_color(color_of_strain(force, position, t)[seen])
 
     def _draw_particles(
         self, frame: ParticleState, position: np.ndarray, alive: np.ndarray, rgba: np.ndarray

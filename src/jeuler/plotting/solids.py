@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib import colors
 
-from jeuler._core.component import as_component
-from jeuler.contact.colliders import Box, Plane, Sphere
+from jeuler.contact.colliders import Sphere
+from jeuler.plotting.surfaces import distances, is_shell, middle, upper_side
 
 FILL, EDGE = "#d9d4c7", "#8a8578"
 
@@ -23,26 +21,14 @@ def draw_colliders(ax: Any, colliders: list[Any], t: float, view: Any) -> list[A
     if len(view.center) == 2:
         return [artist for c in colliders for artist in _in_plane(ax, c, t, view.center, view.half)]
     toward = view.toward_viewer(t)
-    ground = [c for c in colliders if not _middle(c, t).size]
-    solids = [c for c in colliders if _middle(c, t).size]
-    solids.sort(key=lambda c: -np.inf if _is_shell(c) else float(_middle(c, t) @ toward))
+    ground = [c for c in colliders if not middle(c, t).size]
+    solids = [c for c in colliders if middle(c, t).size]
+    solids.sort(key=lambda c: -np.inf if is_shell(c) else float(middle(c, t) @ toward))
     artists = [artist for c in ground for artist in _height(ax, c, t, view.center, view.half)]
     for depth, solid in enumerate(solids):
         draw = _ball if isinstance(solid, Sphere) else _box
-        artists.append(draw(ax, solid, _middle(solid, t), toward, 0.1 + depth / (1 + len(solids))))
+        artists.append(draw(ax, solid, middle(solid, t), toward, 0.1 + depth / (1 + len(solids))))
     return artists
-
-
-def _middle(collider: Any, t: float) -> np.ndarray:
-    """Where a ball or a box is; empty for all others."""
-    if not isinstance(collider, (Sphere, Box)):
-        return np.zeros(0)
-    return np.asarray(collider.center(t) if callable(collider.center) else collider.center)
-
-
-def _is_shell(collider: Any) -> bool:
-    """Whether it is a wall around the particles, of which one sees the far half."""
-    return isinstance(collider, Sphere) and collider.inside
 
 
 def shaded(rgba: np.ndarray, corners: np.ndarray, toward: np.ndarray) -> np.ndarray:
@@ -57,18 +43,6 @@ def shaded(rgba: np.ndarray, corners: np.ndarray, toward: np.ndarray) -> np.ndar
     light = 0.8 * np.array([0.0, 0.0, 1.0]) + 0.5 * left + 0.4 * toward
     strength = 0.45 + 0.6 * np.clip(normal @ (light / np.linalg.norm(light)), 0, 1)
     return np.concatenate([np.clip(rgba[:, :3] * strength[:, None], 0, 1), rgba[:, 3:]], axis=1)
-
-
-def distances(collider: Any, t: float, points: np.ndarray) -> np.ndarray:
-    """The distance at points (..., dim)."""
-    collider = as_component(collider)
-    flat = jnp.asarray(points.reshape(-1, points.shape[-1]))
-    return np.asarray(_distances(collider, jnp.asarray(t, flat.dtype), flat)).reshape(points.shape[:-1])
-
-
-@jax.jit
-def _distances(collider: Any, t: Any, points: Any) -> Any:
-    return jax.vmap(collider, (None, 0))(t, points)
 
 
 def in_sight(colliders: list[Any], t: float, position: np.ndarray, toward: np.ndarray, far: float) -> np.ndarray:
@@ -96,19 +70,19 @@ def _in_plane(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.nda
     return artists
 
 
-def _ball(ax: Any, ball: Any, middle: np.ndarray, toward: np.ndarray, zorder: float) -> Any:
+def _ball(ax: Any, ball: Any, center: np.ndarray, toward: np.ndarray, zorder: float) -> Any:
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 61), np.linspace(0, np.pi, 31))
-    grid = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1) * float(ball.radius) + middle
+    grid = np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1) * float(ball.radius) + center
     faces = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
-    near = (faces.mean(axis=1) - middle) @ toward > 0
-    return _polygons(ax, faces[~near if _is_shell(ball) else near], toward, zorder)
+    near = (faces.mean(axis=1) - center) @ toward > 0
+    return _polygons(ax, faces[~near if is_shell(ball) else near], toward, zorder)
 
 
-def _box(ax: Any, box: Any, middle: np.ndarray, toward: np.ndarray, zorder: float) -> Any:
+def _box(ax: Any, box: Any, center: np.ndarray, toward: np.ndarray, zorder: float) -> Any:
     half, faces = np.broadcast_to(np.asarray(box.half_size), 3), []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        corners = np.tile(middle, (4, 1)).astype(float)
+        corners = np.tile(center, (4, 1)).astype(float)
         corners[:, axis] += half[axis] * (1 if toward[axis] > 0 else -1)  # of two sides one is seen
         corners[:, u] += half[u] * np.array([-1, 1, 1, -1])
         corners[:, v] += half[v] * np.array([-1, -1, 1, 1])
@@ -126,21 +100,8 @@ def _polygons(ax: Any, faces: np.ndarray, toward: np.ndarray, zorder: float, edg
 
 
 def _height(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
-    """The upper side of any other solid: for each place (x, y), the highest z at which the distance is 0."""
-    reach = (5.0 if isinstance(collider, Plane) else 2.0) * half
-    x, y = (np.linspace(center[k] - reach[k], center[k] + reach[k], 61) for k in range(2))
-    z = np.linspace(center[2] - 1.3 * half[2], center[2] + 1.3 * half[2], 96)
-    points = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
-    d = distances(collider, t, points)
-    inside = d <= 0
-    top = d.shape[2] - 1 - np.argmax(inside[:, :, ::-1], axis=2)
-    there = inside.any(axis=2) & (top < d.shape[2] - 1)
-    if not there.any():
+    """The upper side of any other solid."""
+    x, y, height = upper_side(collider, t, center, half)
+    if not np.isfinite(height).any():
         return []
-    i, j = np.indices(top.shape)
-    low = np.minimum(top, d.shape[2] - 2)
-    below, above = d[i, j, low], d[i, j, low + 1]
-    share = np.where(there, below / np.where(below == above, 1, below - above), 0)
-    height = np.where(there, z[low] + share * (z[1] - z[0]), np.nan)
-    x, y = np.meshgrid(x, y, indexing="ij")
     return [ax.plot_surface(x, y, height, color=FILL, alpha=0.85, linewidth=0, antialiased=True, zorder=0)]
