@@ -69,6 +69,13 @@ def test_public_names_are_sorted_and_exist():
     assert jeuler.__version__
 
 
+def test_the_package_shows_its_public_names_and_its_namespaces():
+    packages = "accuracy contact diagnosis effects fitting forces observing plotting samplers scenes steps".split()
+    shown = [name for name in dir(jeuler) if not name.startswith("_")]
+    assert shown == sorted({*jeuler.__all__, *packages})
+    assert all(inspect.ismodule(getattr(jeuler, name)) for name in packages)
+
+
 def test_import_brings_jax_and_nothing_heavier():
     heavy = "['diffrax', 'equinox', 'optax', 'optimistix', 'lineax', 'matplotlib', 'scipy.signal', 'tqdm']"
     code = (

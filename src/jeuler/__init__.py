@@ -227,6 +227,8 @@ _ON_DEMAND = {  # packages that are imported at the first use of a name of their
     ),
     "diagnosis": ("Diagnosis", "diagnose"),
     "observing": (),
+    "plotting": (),
+    "scenes": (),
     "fitting": (
         "Comparison",
         "Fit",
@@ -257,4 +259,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_ON_DEMAND, *__all__})
+    catalogues = {"contact", "effects", "forces", "samplers", "steps"}
+    return sorted({*__all__, *_ON_DEMAND, *catalogues, *(name for name in globals() if name.startswith("__"))})

@@ -59,6 +59,7 @@ def test_solve_is_diffrax_with_the_same_args():
     np.testing.assert_allclose(eqx.filter_jit(final)(ARGS), theirs, rtol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:Explicitly requested dtype")  # 64-bit indices of a closure, in a float32 pilot
 @pytest.mark.parametrize(
     "run",
     [

@@ -68,6 +68,7 @@ def relative(a, b):
     return float(jnp.max(jnp.abs(a - b))) / scale
 
 
+@pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-12), (jnp.float32, 1e-5)])
 def test_agrees_with_diffrax_euler(name, dtype, tolerance):
