@@ -70,7 +70,19 @@ def test_public_names_are_sorted_and_exist():
 
 
 def test_the_package_shows_its_public_names_and_its_namespaces():
-    packages = "accuracy contact diagnosis effects fitting forces observing plotting samplers scenes steps".split()
+    packages = [
+        "accuracy",
+        "contact",
+        "diagnosis",
+        "effects",
+        "fitting",
+        "forces",
+        "observing",
+        "plotting",
+        "samplers",
+        "scenes",
+        "steps",
+    ]
     shown = [name for name in dir(jeuler) if not name.startswith("_")]
     assert shown == sorted({*jeuler.__all__, *packages})
     assert all(inspect.ismodule(getattr(jeuler, name)) for name in packages)

@@ -1,6 +1,7 @@
 """Every public object copies and pickles to an equal one, and shows itself on one screen."""
 
 import copy
+import dataclasses
 import inspect
 import pickle
 import re
@@ -149,6 +150,29 @@ def test_a_fit_of_springs_shows_value_error_and_unit():
     assert (row[0], row[3]) == ("ks", "N/m")
     assert float(row[1]) == pytest.approx(float(found.ks), rel=1e-5)
     assert float(row[2]) == pytest.approx(float(found.stderr["ks"]), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("SpringFit", "ks +[0-9.]+ +[0-9.e-]+ +N/m"),
+        ("Fit", "unused +2 +inf"),
+        ("Identifiability", "ks +[0-9.e-]+ +N/m"),
+        ("FoundSprings", r"0 - 1 +[0-9.]+ \+- [0-9.e-]+ +[0-9.]+ \+- (inf|[0-9.e-]+) +[0-9.]+ \+- [0-9.e-]+"),
+        ("WorkPrecision", "Euler +[0-9.]+ +[0-9]+ +[0-9]+ +[0-9.e-]+ +[0-9.e-]+"),
+    ],
+)
+def test_what_was_found_is_read_in_a_terminal_too(name, line):
+    assert re.search(f"^{line}$", repr(objects.OBJECTS[name]()), re.MULTILINE)
+
+
+def test_a_fit_that_is_traced_or_a_batch_still_has_a_repr():
+    found = objects.OBJECTS["SpringFit"]()
+    seen = []
+    jax.jit(lambda loss: seen.append(repr(dataclasses.replace(found, loss=loss))) or loss)(1.0)
+    many = repr(dataclasses.replace(found, loss=jnp.zeros(2)))
+    assert "params" in seen[0]
+    assert "loss=float64[2]" in many
 
 
 def test_a_fit_says_what_the_data_do_not_determine():

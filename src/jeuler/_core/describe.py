@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import html
+import itertools
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -18,7 +20,7 @@ Part = str | tuple[str, list["Part"], str]  # a text, or what opens, the parts w
 
 
 def summary(x: Any) -> str:
-    """A short description of x: names, dtypes and shapes, never more than a screen."""
+    """A short description of x: names, single numbers, dtypes and shapes of arrays, never more than a screen."""
     for depth in (6, 4, 3, 2, 1):
         lines = _lines(_parts(x, depth), 0, "")
         if len(lines) <= LINES:
@@ -47,7 +49,7 @@ def _parts(x: Any, depth: int) -> Part:
     if callable(inner := getattr(x, "function", None)) and len(vars(x)) == 1:  # a function that was wrapped
         x = inner
     if hasattr(x, "shape") and hasattr(x, "dtype"):
-        return array_type(x)
+        return array_type(x) if np.ndim(x) else values_of(x) or array_type(x)
     fields = fields_of(x)
     name = type(x).__name__
     if fields is not None:
@@ -55,7 +57,7 @@ def _parts(x: Any, depth: int) -> Part:
     if isinstance(x, Mapping):
         return _group("{", [(f"{key!r}: ", value) for key, value in x.items()], "}", depth)
     if isinstance(x, (tuple, list)):
-        opening, closing = "[]" if isinstance(x, list) else "()"
+        opening, closing = "[]" if isinstance(x, list) else ("(", ",)" if len(x) == 1 else ")")
         return _group(opening, [("", value) for value in x], closing, depth)
     if isinstance(x, str):
         return repr(x if len(x) <= MOST_LETTERS else x[: MOST_LETTERS - 3] + "...")
@@ -101,6 +103,21 @@ def table(title: str, rows: Iterable[Sequence[Any]], head: Sequence[str] = (), n
     body = "".join([row(head, "th") if head else "", *(row(cells, "td") for cells in rows)])
     below = f"<div>{html.escape(note)}</div>" if note else ""
     return f"<div><b>{html.escape(title)}</b></div><table>{body}</table>{below}"
+
+
+def text_table(title: str, rows: Iterable[Sequence[Any]], head: Sequence[str] = (), note: str = "") -> str:
+    """The same for a terminal: at most a screen, columns one below the other, the note at the top."""
+    lines = [[str(cell) for cell in row] for row in ([head] if head else [])] + [list(map(str, row)) for row in rows]
+    widths = [max(map(len, column)) for column in itertools.zip_longest(*lines, fillvalue="")]
+    shown = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in lines]
+    above = textwrap.wrap(f"{title}: {note}" if note else title, WIDTH, max_lines=5)
+    room = LINES - len(above)
+    hidden = [f"... {len(shown) - room + 1} more"] if len(shown) > room else []
+    return "\n".join([*above, *(_cut(line) for line in shown[: room - len(hidden)]), *hidden])
+
+
+def _cut(line: str) -> str:
+    return line if len(line) <= WIDTH else f"{line[: WIDTH - 3]}..."
 
 
 def object_table(x: Any) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from jeuler._core import checks
 from jeuler._core.component import result
-from jeuler._core.describe import table
+from jeuler._core.describe import table, text_table
 from jeuler._core.files import write_text
 from jeuler.accuracy.markdown import markdown
 
@@ -229,9 +229,15 @@ class WorkPrecision:
         return markdown(self)
 
     def _repr_html_(self) -> str:
+        return table("WorkPrecision", *self._cells())
+
+    def __repr__(self) -> str:
+        return text_table("WorkPrecision", *self._cells())
+
+    def _cells(self) -> tuple[list[list[str]], list[str]]:
         lines = (line.removeprefix("|").removesuffix("|").split("|") for line in self.to_markdown().splitlines())
         head, _, *rows = ([cell.strip("* ") for cell in cells] for cells in lines)
-        return table("WorkPrecision", rows, head)
+        return rows, head
 
     def plot(self, ax: Any = None, *, against: Any = ("seconds", "dt"), error: str = "final") -> Any:
         """Errors, logarithmic, each method labelled at its line.

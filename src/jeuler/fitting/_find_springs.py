@@ -11,6 +11,7 @@ from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.fitting._springs import SpringFit
+from jeuler.fitting._tables import springs_text
 from jeuler.fitting.finding.refined import refined, springs_of
 from jeuler.fitting.finding.tracked import Tracked
 from jeuler.fitting.finding.whole_motion import by_whole_motion, in_doubt
@@ -63,6 +64,8 @@ class FoundSprings:
     state: ParticleState
     fit: SpringFit | None
     message: str
+
+    __repr__ = springs_text
 
 
 @says_what_to_write(edges="candidates=", masses="mass=")

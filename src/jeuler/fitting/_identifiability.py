@@ -12,6 +12,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
+from jeuler.fitting._tables import identifiability_text
 from jeuler.fitting.blind import describe_blind
 from jeuler.fitting.evaluate import residual_and_jacobian
 from jeuler.fitting.observations import amplitude_of
@@ -55,6 +56,8 @@ class Identifiability:
     blind: tuple[str, ...]
     sigma: float
     message: str
+
+    __repr__ = identifiability_text
 
 
 @says_what_to_write(dts="dt=...", noise="sigma=...", positions="times, when positions will be measured")

@@ -1,4 +1,4 @@
-"""Fits as tables for a notebook: each parameter with its unit and standard error."""
+"""Fits as tables for a notebook and for a terminal: each parameter with its unit and standard error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jeuler._core.describe import table, values_of
+from jeuler._core.describe import object_table, summary, table, text_table, values_of
 
 UNITS = {
     "ks": "N/m",
@@ -50,9 +50,40 @@ def parameter_rows(params: Any, stderr: Any, unit: Any = lambda name: "") -> lis
 
 def fit_table(found: Any) -> str:
     """A `Fit` or `SpringFit`: parameters with standard errors (and units, of a scene), the loss, and what happened."""
+    return table(*_fit(found)) if _is_one(found) else object_table(found)
+
+
+def fit_text(found: Any) -> str:
+    """The same for a terminal."""
+    return text_table(*_fit(found)) if _is_one(found) else summary(found)
+
+
+def _is_one(found: Any) -> bool:
+    """Whether this is one fit with its numbers, and neither a batch of fits nor one that is being traced."""
+    traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((found.params, found.loss)))
+    return not traced and np.ndim(found.loss) == 0
+
+
+def _fit(found: Any) -> tuple[str, list[tuple[str, ...]], tuple[str, ...], str]:
     scene = getattr(found, "scene", None)
     rows = parameter_rows(found.params, found.stderr, lambda name: "" if scene is None else unit_of(name, scene))
     more = [(f"... {len(rows) - MOST_ROWS} more", "", "", "")] if len(rows) > MOST_ROWS else []
     loss = f"loss {found.loss:.4g}{'' if scene is None else ' m^2'} after {len(found.history)} iterations"
     head = ("parameter", "value", "standard error", "unit")
-    return table(type(found).__name__, [*rows[:MOST_ROWS], *more], head, f"{loss}; {found.message}")
+    return type(found).__name__, [*rows[:MOST_ROWS], *more], head, f"{loss}; {found.message}"
+
+
+def identifiability_text(asked: Any) -> str:
+    """An `Identifiability` for a terminal: the standard error that each parameter would have."""
+    rows = [(name, error, unit) for name, error, _, unit in parameter_rows(asked.stderr, None, unit_of)]
+    return text_table("Identifiability", rows, ("parameter", "standard error", "unit"), asked.message)
+
+
+def springs_text(found: Any) -> str:
+    """A `FoundSprings` for a terminal: each spring with its standard errors."""
+    names = ("ks", "kd", "rest_length")
+    columns = [(getattr(found, name), found.stderr[name]) for name in names]
+    values = [[f"{v:.5g} +- {e:.2g}" for v, e in zip(*column, strict=True)] for column in columns]
+    rows = [(f"{i} - {j}", *row) for (i, j), *row in zip(found.edges, *values, strict=True)]
+    head = ("particles", "ks, N/m", "kd, N s/m", "rest length, m")
+    return text_table("FoundSprings", rows, head, found.message)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jeuler._core.component import result
-from jeuler.fitting._tables import fit_table
+from jeuler.fitting._tables import fit_table, fit_text
 from jeuler.fitting.beside import attached
 from jeuler.fitting.errors import error_of
 from jeuler.fitting.profiles import AGAIN, Profile
@@ -75,6 +75,7 @@ class Fit:
     starts: Any = None
 
     _repr_html_ = fit_table
+    __repr__ = fit_text
 
     def profile(self, name: str, *, level: float = 0.95) -> Profile:
         """The profile-likelihood interval of one parameter: how far it can go when all others follow.

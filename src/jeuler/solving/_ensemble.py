@@ -12,6 +12,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jeuler._core import checks
+from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import Function, result
 from jeuler._jax import programs
 from jeuler.solving._scan import Solution
@@ -44,6 +45,7 @@ class Ensemble:
     count: int
 
 
+@says_what_to_write(batch_size="batch=...", reducers="reduce=...", keys="members")
 def ensemble(
     run: Callable[[PyTree], PyTree],
     members: PyTree,
