@@ -150,6 +150,13 @@ def test_patience_bounds_what_is_begun():
     assert "were not tried, as patience= was over" in advice.reason
 
 
+def test_patience_lasts_longer_while_nothing_reaches_the_target_and_what_was_not_tried_is_said(monkeypatch):
+    monkeypatch.setattr("jeuler.accuracy.choice._Ranking.spent", 2.0)
+    advice = jeuler.advise_method(decay, 1.0, t1=1.0, error=1e-2, methods=EXPLICIT, patience=1.0)
+    assert advice.best.name == next(iter(EXPLICIT))
+    assert "1 of 2 methods were not tried, as patience= was over" in advice.reason
+
+
 def test_where_no_reference_is_known_nothing_is_ranked():
     jumpy = lambda t, y, args: jnp.where(jnp.sin(1e6 * t * t) > 0, 50.0, -49.0)  # noqa: E731
     advice = jeuler.advise_method(jumpy, 1.0, t1=1.0, error=1e-9, methods=EXPLICIT)

@@ -39,6 +39,7 @@ FIRST = 1.0  # s, while there is none
 CLOSE = 3.0  # times the fastest: timed again, in turns, as `solve` runs them
 ROUNDS = 9
 NOT_TRIED = "not tried: patience= would be over"
+WITHOUT = 3.0  # times the patience, while no method has reached the target
 HEAD = "method", "dt, s", "rtol", "steps", "seconds", "error", "reason"
 
 
@@ -179,7 +180,8 @@ def advise_method(
       methods: ``{name: method}``, steps and diffrax solvers (by tolerance where they estimate their error), or None in
         place of a method for `solve_adaptive`; None takes all steps of the library and diffrax's Euler, Heun, Tsit5
         and Kvaerno5, if diffrax is installed.
-      patience: seconds of trials and compilation after which no further method is begun.
+      patience: seconds of trials and compilation after which no further method is begun; three times that while none
+        has reached the target. The reason says how many were not tried.
     Returns: `MethodAdvice`; print it for the table.
     Raises: ValueError, naming the argument, what was expected and what came.
     Example:
@@ -204,8 +206,7 @@ def advise_method(
     )
     absent = methods is None and not has_diffrax()
     left_out = asked.left_out + ("; diffrax is not installed, so without its solvers" if absent else "")
-    ranking = _Ranking(problem, asked.error, relative, begun + float(patience), asked.name)
-    return ranking.advice(candidates, begun, left_out)
+    return _Ranking(problem, asked.error, relative, begun, float(patience), asked.name).advice(candidates, left_out)
 
 
 def _checked(methods: Any) -> Mapping[str, Any]:
@@ -227,9 +228,11 @@ def _checked(methods: Any) -> Mapping[str, Any]:
 class _Ranking:
     """Trials of the candidates on one problem."""
 
-    def __init__(self, problem: Problem, error: float, relative: bool, until: float, scene: str) -> None:
+    def __init__(
+        self, problem: Problem, error: float, relative: bool, begun: float, patience: float, scene: str
+    ) -> None:
         self.problem, self.error, self.relative = problem, error, relative
-        self.until, self.scene, self.size = until, scene, 1.0
+        self.begun, self.patience, self.scene, self.size = begun, patience, scene, 1.0
         self.stiff = False
         self.dtype = np.dtype(trees.time_dtype(problem.y0))
         self.known: dict[tuple[str, Any], Trial] = {}
@@ -241,7 +244,12 @@ class _Ranking:
             self.known[key] = Trial(candidate, self.problem, dtype)
         return self.known[key]
 
-    def advice(self, candidates: list[Candidate], begun: float, left_out: str) -> MethodAdvice:
+    @property
+    def spent(self) -> float:
+        """Seconds since the question was asked."""
+        return time.perf_counter() - self.begun
+
+    def advice(self, candidates: list[Candidate], left_out: str) -> MethodAdvice:
         final, known_to = self.reference()
         if final is None:
             reason = (
@@ -249,21 +257,22 @@ class _Ranking:
                 "or take too many steps; take a larger error, a shorter interval, or name the jumps of f in breaks="
             )
             rows = [self.row(c, Found(None, 0, math.nan, math.nan, "not judged")) for c in candidates]
-            return MethodAdvice(tuple(rows), self.error, reason + left_out, math.nan, time.perf_counter() - begun)
+            return MethodAdvice(tuple(rows), self.error, reason + left_out, math.nan, self.spent)
         found = self.run_all(candidates, final)
         rows = [self.row(candidate, found[candidate.name]) for candidate in candidates]
         rows.sort(key=lambda row: row.seconds if math.isfinite(row.seconds) else math.inf)
         advice = MethodAdvice(tuple(rows), self.error, "", known_to, 0.0)
         reason = self.in_one_line(advice.best, sum(row.reason == NOT_TRIED for row in rows), len(rows)) + left_out
-        return dataclasses.replace(advice, reason=reason, trial_seconds=time.perf_counter() - begun)
+        return dataclasses.replace(advice, reason=reason, trial_seconds=self.spent)
 
     def in_one_line(self, best: RankedMethod | None, not_tried: int, count: int) -> str:
+        untried = f"; {not_tried} of {count} methods were not tried, as patience= was over: raise it"
+        untried = untried if not_tried else ""
         if best is None:
-            time = f"; {not_tried} of {count} were not tried, as patience= was over: raise it" if not_tried else ""
-            return f"no method tried reaches an error of {self.error:g}{time}"
+            return f"no method tried reaches an error of {self.error:g}{untried}"
         how = f"rtol = {best.rtol:.1e}" if math.isfinite(best.rtol) else f"dt = {best.dt:.3g} s"
         steps = f"{best.num_steps:,} step{'s' * (best.num_steps != 1)}"
-        return f"for an error of {self.error:g} use {best.name}, {how}, {steps}: {milliseconds(best.seconds)}"
+        return f"for an error of {self.error:g} use {best.name}, {how}, {steps}: {milliseconds(best.seconds)}{untried}"
 
     def scale(self, final: np.ndarray) -> float:
         size = float(np.linalg.norm(final))
@@ -295,7 +304,7 @@ class _Ranking:
         if self.stiff:  # first those that are likely to be fast there
             candidates = sorted(candidates, key=lambda candidate: not candidate.program_size)
         for candidate in candidates:
-            left = self.until - time.perf_counter()
+            left = self.patience * (WITHOUT if math.isinf(fastest) else 1.0) - self.spent
             trial = self.trial(candidate, self.dtype)
             if left < (0.0 if trial.known else candidate.program_size * explicit_compile):
                 found[candidate.name] = Found(None, 0, math.nan, math.nan, NOT_TRIED)

@@ -35,6 +35,7 @@ EVEN = 2.5  # times the error that the order of the step tells of them
 BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
 ACCIDENT = 3  # times the fewest steps at most, for an error that is no accident of the grid
 FINER, FINE = 1.1, 1.02  # from one number of steps to the next where errors are uneven, many or few
+BETWEEN = 20, 400  # numbers of steps at least and at most, where the error of all these was far below the target
 REFERENCE_RTOL = 1e-8, 1e-11, 1e-13  # of adaptive runs; the first that agrees with the one before is the reference
 REFERENCE_STEPS, STIFF_REFERENCE_STEPS = 65_536, 8_192
 STIFF_STEP = extrapolated_euler(6, step=linearly_implicit_euler_step)
@@ -309,7 +310,8 @@ class Search:
         The numbers of steps are 2 % apart where these are few, and else 10 % and then 1 %. They begin at a quarter of
         what stability asks for, half if that is many, or at ``start``. An error far below the target beside others that
         are not is an accident of where the jumps fall on that grid: it is taken only if no other number of steps up to
-        three times as many will do.
+        three times as many will do. Where only an error far below the target was found, up to 400 numbers of steps are
+        run from half as many on.
         """
         many = self.most > self.planned
         num_steps = start or max(1, math.floor(self.interval / self.bound / (2 if many else 4)))
@@ -331,8 +333,8 @@ class Search:
         if math.isinf(error_of(round(found / FINER))):
             found = self.on_edge(error_of, found)
         elif error_of(found) < 1 / FACTOR and not many:
-            between = (math.ceil(n) for n in np.linspace(found / FINER, found * FINER, 20))
-            near = (n for n in between if n >= least and error_of(n) >= 1 / FACTOR and meets(n))
+            between = np.linspace(max(least, found / 2), found * FINER, int(np.clip(self.most // found, *BETWEEN)))
+            near = (n for n in map(math.ceil, between) if error_of(n) >= 1 / FACTOR and meets(n))
             found = next(near, found)
         return found, error_of(found) * self.error * self.scale(final)
 
