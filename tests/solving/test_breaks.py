@@ -115,6 +115,30 @@ def test_a_break_gives_fixed_steps_their_order_back(step, time):
     assert np.log2(error(40) / error(160)) / 2 == pytest.approx(order, abs=0.25)
 
 
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.rk4_step, jeuler.implicit_euler_step])
+def test_breaks_hold_backwards_in_time_beside_far_ones_and_in_a_batch_of_both_directions(step):
+    """y' = 1 before the break b and -1 after it: from y = 0, 2 b - 1 after one second of both."""
+
+    def end(dt, t0, b):
+        field = lambda t, y, b: jnp.where(t < b, 1.0, -1.0) * jnp.ones_like(y)  # noqa: E731
+        breaks = jnp.stack([b, b, 1e300, -7.0, 0.2])
+        return jeuler.solve(field, 0.0, dt=dt, num_steps=10, t0=t0, step=step, args=b, breaks=breaks).y[-1]
+
+    dts, t0s = jnp.array([0.1, -0.1] * 5), jnp.array([0.0, 1.0] * 5)
+    breaks = jnp.repeat(jnp.array([0.53, 0.5, 0.0, 1.0, jnp.nan]), 2)
+    ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end, argnums=2)))(dts, t0s, breaks)
+    np.testing.assert_allclose(ends, jnp.sign(dts) * (2 * breaks - 1), atol=1e-14)
+    np.testing.assert_allclose(slopes[:4], 2 * jnp.sign(dts)[:4], atol=1e-14)
+
+
+def test_adaptive_steps_heed_a_break_beside_a_far_one_and_none_that_is_nan():
+    field = lambda t, y, args: jnp.where(t < 0.53, 1.0, -1.0) * jnp.ones_like(y)  # noqa: E731
+    run = jax.jit(lambda b: jeuler.solve_adaptive(field, 0.0, t1=1.0, breaks=jnp.stack([b, 0.53])))
+    assert float(run(1e300).y[-1]) == pytest.approx(0.06, abs=1e-14)
+    assert np.isnan(run(jnp.nan).y[-1])
+    assert not run(jnp.nan).finished
+
+
 def test_a_jump_at_the_end_must_be_named_too():
     field = lambda t, y, args: jnp.where(t < 1.0, 1.0, 5.0)  # noqa: E731
     ends = [
@@ -133,10 +157,13 @@ def test_breaks_stop_adaptive_steps_without_a_rejection():
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
 def test_the_derivative_with_respect_to_a_break_is_that_of_the_solution(derivative):
+    """At one of the times asked for, and within a step; on the grid in the test of both directions."""
     right = -RATE * np.exp(-RATE * 0.8)
 
     def adaptive(time):
-        return jeuler.solve_adaptive(switched, 1.0, t1=2.0, args=time, rtol=1e-10, atol=1e-12, breaks=[time]).y[-1]
+        return jeuler.solve_adaptive(switched, 1.0, t1=[0.8, 2.0], args=time, rtol=1e-10, atol=1e-12, breaks=[time]).y[
+            -1
+        ]
 
     def fixed(time):
         return jeuler.solve(

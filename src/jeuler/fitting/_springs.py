@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from jeuler._core import checks
@@ -247,8 +247,8 @@ def _check_choices(parameters: Any, start: Any, grow: Any, step_bias: Any) -> No
     checks.true_or_false("step_bias", step_bias)
     if start not in ("data", "given"):
         raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
-    if isinstance(parameters, str):
-        raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {parameters!r}')
+    if isinstance(parameters, str) or not isinstance(parameters, Iterable):
+        raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {checks.shown(parameters)}')
 
 
 def _completed(task: Recorded | Several, found: Any, begun: str, step_bias: bool, whole: Any, held: Any) -> SpringFit:

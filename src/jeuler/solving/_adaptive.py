@@ -163,7 +163,7 @@ def _solve_adaptive(
     """`solve_adaptive`, as it is compiled."""
     f, step = field.function, stepper.function
     checks.vector_field(f, t0, y0, args)
-    times = jnp.where(_in_order(t0, times), times, jnp.nan)
+    times = jnp.where(_in_order(t0, times) & ~jnp.any(jnp.isnan(breaks)), times, jnp.nan)
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
     if max_dt is not None:
@@ -186,6 +186,12 @@ def _solve_adaptive(
         going = lambda at: (at.t < end) & (at.tried < most)  # noqa: E731
         at = bounded_while(going, attempt, at, max_steps)
         reached = at.t >= end
+        if breaks.size:  # a break at one of the times: nothing moves, but the derivative with respect to it counts
+            moved = jax.tree.map(
+                lambda y, slope: y + ((end - at.t) * slope).astype(y.dtype), at.y, here(end, at.y, args)
+            )
+            y = jax.tree.map(lambda a, b: jnp.where(reached, a, b), moved, at.y)
+            at = at._replace(t=jnp.where(reached, end, at.t), y=y)
         return at, (jax.tree.map(lambda leaf: jnp.where(reached, leaf, jnp.nan), at.y), reached)
 
     none, no_error = jnp.int32(0), jax.tree.map(jnp.zeros_like, y0)

@@ -15,6 +15,7 @@ from jeuler.steps.explicit import VectorField
 
 PyTree = Any
 SIDE = 8  # units in the last place that "just before" and "just after" a break are away from it
+ROUNDING = 0.25  # part of these by which a time of the grid may miss a break through rounding
 
 
 def checked_breaks(breaks: Any, dtype: Any) -> Array:
@@ -28,17 +29,18 @@ def checked_breaks(breaks: Any, dtype: Any) -> Array:
     return jnp.sort(jnp.atleast_1d(jnp.asarray(given)))
 
 
-def margin(breaks: Array) -> Array:
-    """How far "just before" is, for each of the breaks, s."""
-    eps = jnp.finfo(breaks.dtype).eps
-    return lax.stop_gradient(SIDE * eps * jnp.maximum(jnp.abs(breaks), jnp.max(jnp.abs(breaks), initial=0) / 8))
+def margin(breaks: Array, first: Array, last: Array) -> Array:
+    """How far "just before" is for each of the breaks, in a step between these times, s."""
+    largest = jnp.maximum(jnp.abs(breaks), jnp.maximum(jnp.abs(first), jnp.abs(last)))
+    return lax.stop_gradient(SIDE * jnp.finfo(breaks.dtype).eps * largest)
 
 
 def between(f: VectorField, breaks: Array, start: Array, end: Array) -> VectorField:
-    """f on the steps from start to end: evaluated just after start and just before end where these are breaks."""
-    gap = margin(breaks)
-    after = jnp.max(jnp.where(jnp.abs(breaks - start) <= gap, breaks + gap, -jnp.inf))
-    before = jnp.min(jnp.where(jnp.abs(breaks - end) <= gap, breaks - gap, jnp.inf))
+    """f on the step from start to end, forwards or backwards: evaluated just inside of an end that is a break."""
+    first, last = jnp.minimum(start, end), jnp.maximum(start, end)
+    gap = margin(breaks, first, last)
+    after = jnp.max(jnp.where(jnp.abs(breaks - first) <= gap, breaks + gap, -jnp.inf))
+    before = jnp.min(jnp.where(jnp.abs(breaks - last) <= gap, breaks - gap, jnp.inf))
 
     def inside(t, y, args):
         return f(jnp.minimum(jnp.maximum(t, after), before), y, args)
@@ -47,23 +49,34 @@ def between(f: VectorField, breaks: Array, start: Array, end: Array) -> VectorFi
 
 
 def split_at(advance: Callable, breaks: Array) -> Callable:
-    """``advance(f, t, state, dt, args)`` that ends a step at each break within it and goes on from there."""
+    """``advance(f, t, state, dt, args)`` that ends a step at each break within it and goes on from there.
+
+    A break that is a time of the grid, to rounding, belongs to the step that begins there, as the end of a first piece
+    of no length. That moves nothing, but its derivative counts: (f just before - f just after) for each of the break.
+    """
 
     def split(f, t, state, dt, args):
-        end, gap = t + dt, margin(breaks)
-        near = jnp.any((breaks >= t - gap) & (breaks <= end + gap))
+        end, direction = t + dt, jnp.sign(dt)  # dt may be negative
+        first, last = jnp.minimum(t, end), jnp.maximum(t, end)
+        gap = margin(breaks, first, last)
+        apart = (breaks < first - gap) | (breaks > last + gap)  # False for a break that is NaN: then the state is
 
-        def piece(carry, stop):
-            begin, state = carry
+        def piece(carry, stop_and_whether_inside):
+            (begin, state), (stop, inside) = carry, stop_and_whether_inside
             h = stop - begin
-            some = h > 0
-            moved = advance(between(f, breaks, begin, stop), begin, state, jnp.where(some, h, dt), args)
+            some = inside | (h != 0)
+            here = between(f, breaks, jnp.where(h != 0, begin, begin - dt), stop)
+            moved = advance(here, begin, state, jnp.where(some, h, dt), args)
             return (stop, jax.tree.map(lambda a, b: jnp.where(some, a, b), moved, state)), None
 
         def in_pieces(state):
-            stops = jnp.append(jnp.clip(breaks, t, end), end)
-            return lax.scan(piece, (t, state), stops)[0][1]
+            met = jnp.where(dt < 0, breaks[::-1], breaks)
+            ahead, rounding = (met - t) * direction, margin(met, first, last) * ROUNDING
+            inside = (ahead >= -rounding) & ((end - met) * direction > rounding)
+            at_break = met + lax.stop_gradient(jnp.where(ahead < 0, t - met, 0))
+            stops = jnp.where(inside | jnp.isnan(met), at_break, jnp.where(ahead < 0, t, end))
+            return lax.scan(piece, (t, state), (jnp.append(stops, end), jnp.append(inside, False)))[0][1]
 
-        return lax.cond(near, in_pieces, lambda state: advance(f, t, state, dt, args), state)
+        return lax.cond(jnp.all(apart), lambda state: advance(f, t, state, dt, args), in_pieces, state)
 
     return split
