@@ -3,7 +3,8 @@
     python benchmarks/first_answer.py             a table; about ten minutes on two cores
     python benchmarks/first_answer.py solve fit   these rows alone
 
-jax-md's bonds have no dampers: less work. Fits beside mujoco.sysid: `python benchmarks/fits_mujoco.py 3`.
+jax-md's bonds have no dampers: less work. Warp's cache is in the same folder. The fit of four springs is that of
+`benchmarks/fits_mujoco.py 3`, imports included.
 
 Each figure is of processes of their own, medians of `ROUNDS`: seconds by the clock, seconds of CPU, programs compiled.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import resource
 import statistics
 import subprocess
@@ -32,17 +34,57 @@ SOLVE = "print(jeuler.solve(f, jnp.array([1., 0.]), dt=0.01, num_steps=1000, sav
 DIFFRAX = """import diffrax
 print(diffrax.diffeqsolve(diffrax.ODETerm(f), diffrax.Euler(), 0., 10., 0.01, jnp.array([1., 0.]), args=0.1).ys[-1])
 """
-CLOTH = """
-import numpy as np, jeuler
+NET = """
+import numpy as np
 n = 64
 k = np.arange(n * n).reshape(n, n)
 pairs = [(k[:-1], k[1:]), (k[:, :-1], k[:, 1:]), (k[:-1, :-1], k[1:, 1:]), (k[1:, :-1], k[:-1, 1:])]
 edges = np.concatenate([np.stack([a.ravel(), b.ravel()], 1) for a, b in pairs])
 start = np.stack([*np.meshgrid(np.arange(n), np.arange(n), indexing="ij"), np.zeros((n, n))], -1).reshape(-1, 3)
+"""
+CLOTH = (
+    NET
+    + """
+import jeuler
 state = jeuler.ParticleState(jnp.asarray(start, jnp.float32), jnp.zeros((n * n, 3), jnp.float32))
 def run(ks):
     scene = jeuler.Scene((jeuler.Gravity([0., 0., -9.81]), jeuler.Springs(edges, ks, 0.1, 1.0)))
     return jeuler.simulate(scene, state, dt=1e-3, num_steps=100, save_every=100).y.position[-1]
+"""
+)
+WARP = """
+import warp as wp, warp_kernels as kernels
+wp.config.quiet = True
+single = lambda k: wp.array([k], dtype=float, device="cpu", requires_grad=True)
+vectors = lambda x: wp.array(x, dtype=wp.vec3, device="cpu", requires_grad=True)
+ks, kd, loss = single(1000.), single(0.1), single(0.)
+ends = wp.array(edges, dtype=wp.vec2i, device="cpu")
+rest = wp.array(np.ones(len(edges)), dtype=float, device="cpu")
+def run():
+    x, v = vectors(start), vectors(0 * start)
+    for _ in range(100):
+        f, then = vectors(0 * start), (vectors(0 * start), vectors(0 * start))
+        wp.launch(kernels.spring_forces, len(edges), inputs=[x, v, ends, rest, ks, kd, f], device="cpu")
+        wp.launch(kernels.move, len(start), inputs=[x, v, f, *then, 1e-3, 9.81, 0.0], device="cpu")
+        x, v = then
+    return x
+"""
+WARP_GRADIENT = """
+with wp.Tape() as tape:
+    wp.launch(kernels.sum_of_squares, len(start), inputs=[run(), loss], device="cpu")
+tape.backward(loss)
+print(ks.grad.numpy())
+"""
+CHAIN = """
+import numpy as np, scipy.linalg
+from fits_mujoco import by_jeuler, by_mujoco, chain
+x, v, ks, kd = chain(3)
+stiff, damp = (np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1) for k in (ks, kd))
+step = scipy.linalg.expm(0.01 * np.block([[np.zeros((3, 3)), np.eye(3)], [-stiff, -damp]]))
+states = [np.concatenate([np.zeros(3), v[1:-1]])]
+for _ in range(400):
+    states.append(step @ states[-1])
+y = x[1:-1] + np.array(states)[:, :3] + 1e-3 * np.random.default_rng(1).normal(size=(401, 3))
 """
 JAX_MD = """
 from jax_md import energy, space
@@ -79,17 +121,28 @@ ROWS = {
     "gradient": FIELD + CLOTH + "print(jax.grad(lambda ks: jnp.sum(run(ks) ** 2))(1000.))",
     "simulate, jax-md": FIELD + CLOTH + JAX_MD + "print(run(1000.)[0])",
     "gradient, jax-md": FIELD + CLOTH + JAX_MD + "print(jax.grad(lambda ks: jnp.sum(run(ks) ** 2))(1000.))",
+    "simulate, Warp": NET + WARP + "print(run().numpy()[0])",
+    "gradient, Warp": NET + WARP + WARP_GRADIENT,
     "fit": FIELD + DECAY + FIT,
     "fit, SciPy": DECAY + SCIPY,
+    "fit of four springs": CHAIN + "import jax\njax.config.update('jax_enable_x64', True)\nprint(by_jeuler(x, v, y))",
+    "fit of four springs, mujoco": CHAIN + "print(by_mujoco(x, v, y))",
     "command line": "import sys\nsys.argv = ['jeuler', 'fit', '--plot', 'out.png']\n"
     "from jeuler.__main__ import main\nmain()",
 }
+PEERS = {"diffrax": "diffrax", "jax-md": "jax_md", "SciPy": "scipy", "Warp": "warp", "mujoco": "mujoco"}
+
+
+def path_with(folder: str) -> str:
+    """The search path of modules with this folder, in which the kernels of Warp and the fits of chains are."""
+    return os.pathsep.join([os.path.abspath(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 
 def once(source: str, cache: str) -> tuple[float, float, int]:
     """Seconds by the clock, seconds of CPU, and programs compiled or read, of one process."""
-    source = source if "jax" not in source and "jeuler" not in source else COUNTED + source
+    source = COUNTED + source if re.search(r"^import (jax|jeuler)", source, re.MULTILINE) else source
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    environment |= {"WARP_CACHE_PATH": os.path.join(cache, "warp"), "PYTHONPATH": path_with(os.path.dirname(__file__))}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     done = subprocess.run(
@@ -117,6 +170,6 @@ def row(name: str) -> str:
 if __name__ == "__main__":
     print("| | empty cache, s | of CPU | warm cache, s | of CPU | programs |\n|---|--:|--:|--:|--:|--:|")
     for name in sys.argv[1:] or ROWS:
-        needs = {"diffrax": "diffrax", "jax-md": "jax_md", "SciPy": "scipy"}.get(name.rpartition(", ")[2])
-        if needs is None or importlib.util.find_spec(needs):
+        peer = name.rpartition(", ")[2]
+        if peer not in PEERS or importlib.util.find_spec(PEERS[peer]):
             print(row(name), flush=True)
