@@ -210,8 +210,8 @@ def fit_springs(
       >>> round(float(found.ks), 2), round(float(found.kd), 2)  # 3^2 + 0.25^2 and 2 * 0.25
       (9.06, 0.5)
 
-    Source: the source's springs and dampers; K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least
-      Squares Problems, 2004.
+    Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems,
+      2004.
     """
     options = Options(
         loss=loss,

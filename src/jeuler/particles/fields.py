@@ -38,9 +38,8 @@ def uses(
       acts: when an effect acts: "before motion", "after motion", as without a word, or "start and after motion", once
         before the first step as well.
     Returns: a decorator that gives the function back, with these as its attributes.
-    Raises: ValueError, if acts is none of these; in `simulate`, if nothing
-      provides a field that is read, or two
-      effects write one in conflict.
+    Raises: ValueError, if acts is none of these; in `simulate`, if nothing provides a field that is read, or
+      two effects write one in conflict.
     Example:
       >>> import jeuler
       >>> @jeuler.uses(reads=("temperature",))
