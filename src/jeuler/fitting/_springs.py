@@ -25,6 +25,7 @@ from jeuler.fitting.recorded import Recorded
 from jeuler.fitting.result import DENSITY, Fit, as_pytree
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
+from jeuler.solving.grid import Checkpoint
 from jeuler.steps.explicit import Step, rk4_step
 
 PyTree = Any
@@ -133,7 +134,11 @@ def fit_springs(
     t0: float = 0.0,
     num_steps: int | None = None,
     step: Step = rk4_step,
+    key: Any = None,
+    checkpoint: Checkpoint = None,
     optimizer: Any = None,
+    minibatch: int | None = None,
+    window: int | None = None,
     max_iterations: int = 200,
     tolerance: float = 1e-4,
     grow: bool = True,
@@ -163,7 +168,8 @@ def fit_springs(
       recordings: several `Recording` in place of times and positions, of any lengths and rates, fitted together:
         each has its own initial positions, velocities and anchors where these are ``parameters``; all else is shared.
       parameters: what is free: any of "ks", "kd", "rest_length" (of the scene's springs, or another parameter of its
-        forces, such as "coefficient" of a drag; "forces[1].ks" names that of one force), "mass" (of the particles that
+        forces, or of its effects, such as "coefficient" of a drag or "restitution" of collisions; "forces[1].ks" and
+        "effects[0].restitution" name that of one), "mass" (of the particles that
         can move), "velocity", "position" (their initial ones) and "anchors" (positions of the pinned particles).
         What cannot be negative by its meaning is fitted from 0 on, 0 included.
       where: a function of the scene that picks further arrays to fit, such as ``lambda scene: scene.forces[1].ks``;
@@ -188,7 +194,14 @@ def fit_springs(
       t0: time of the state, s.
       num_steps: number of steps; None takes as many as reach the last time.
       step: the method, as in `solve`.
+      key: a ``jax.random.key`` for effects that draw random numbers, as in `simulate`: each run draws the same.
+      checkpoint: memory of reverse mode, as in `solve`: a number of steps or "sqrt". Above 500 unknowns, and with an
+        ``optimizer``, a fit differentiates in reverse. The file that a fit goes on from is ``resume``.
       optimizer: None for Levenberg-Marquardt, or any optax optimiser, as in `fit`.
+      minibatch: for ``optimizer``: each of its steps looks at so many windows of the record, drawn anew in every pass
+        over them. A window is run by itself from the smoothed positions and velocities at its start, so all free
+        particles must be observed. The history, the best and the verdict are of the whole record, run from ``state``.
+      window: samples in each of them, at least 2; None takes a sixteenth of the record, at least 4.
       max_iterations: the most iterations in each stage.
       tolerance: how near the minimum must be, in standard errors, by the linear model, as in `fit`.
       grow: from given values, fit the first sixteenth of the time span first, then twice as much and so on: what keeps
@@ -213,28 +226,22 @@ def fit_springs(
     Source: K. Madsen, H. B. Nielsen, O. Tingleff, Methods for Non-Linear Least Squares Problems,
       2004.
     """
-    options = Options(
-        loss=loss,
-        loss_scale=loss_scale,
-        starts=starts,
-        optimizer=optimizer,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-        resume=resume,
-        progress=progress,
-    )
+    how: dict[str, Any] = {"loss": loss, "loss_scale": loss_scale, "starts": starts, "resume": resume}
+    how |= {"optimizer": optimizer, "minibatch": minibatch, "progress": progress}
+    options = Options(**how, max_iterations=max_iterations, tolerance=tolerance)
     _check_choices(parameters, start, grow, step_bias)
+    _check_run(key, checkpoint, minibatch, window)
     records = [Recording(times, positions)] if recordings is None else listed(recordings, times, positions)
     whole, held = [each.values for each in records], None
     if held_out is not None:
         records, held = recordings_without(held_out, records)
     of_scene: dict[str, Any] = {"dt": dt, "t0": t0, "step": step, "names": parameters, "where": where, "ties": ties}
+    of_scene |= {"key": key, "checkpoint": checkpoint}
     if recordings is None and observe == "position" and not any(name in SENSOR_PARAMETERS for name in parameters):
         task = Recorded.of(scene, state, times, records[0].values, num_steps=num_steps, **of_scene)
-        found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors, smoothness)
+        found, begun = task.fit(options, bounds, sigma, weights, start, grow, priors, smoothness, window)
         return _completed(task, found, begun, step_bias, whole[0], held)
-    if num_steps is not None:
-        raise ValueError("num_steps is for positions alone; leave it out: the run reaches the last time")
+    _refuse_what_is_for_positions(minibatch, num_steps)
     of_record = {"observe": observe, "bounds": bounds, "sigma": sigma, "weights": weights}
     of_record |= {"single": recordings is None, "per_recording": per_recording}
     several = Several.of(scene, state, records, **of_record, **of_scene)
@@ -249,6 +256,26 @@ def _check_choices(parameters: Any, start: Any, grow: Any, step_bias: Any) -> No
         raise ValueError(f'start must be "data" (from the positions) or "given" (the scene\'s values), got {start!r}')
     if isinstance(parameters, str) or not isinstance(parameters, Iterable):
         raise ValueError(f'parameters must be a tuple of names such as ("ks", "kd"), got {checks.shown(parameters)}')
+
+
+def _check_run(key: Any, checkpoint: Any, minibatch: Any, window: Any) -> None:
+    if window is not None:
+        checks.count("window", window, least=2)
+        if minibatch is None:
+            raise ValueError("window is for minibatch; pass minibatch=8 and an optax optimizer too, or leave it out")
+    checks.random_key(key)
+    if checkpoint == "reversible":
+        raise ValueError(
+            'checkpoint must be a number of steps, "sqrt" or None for a fit, got "reversible": it also runs forwards '
+            'with derivatives, which that cannot; pass checkpoint="sqrt"'
+        )
+
+
+def _refuse_what_is_for_positions(minibatch: Any, num_steps: Any) -> None:
+    if minibatch is not None:
+        raise ValueError("minibatch is for positions of one record; leave it out, or write the residual for jeuler.fit")
+    if num_steps is not None:
+        raise ValueError("num_steps is for positions alone; leave it out: the run reaches the last time")
 
 
 def _completed(task: Recorded | Several, found: Any, begun: str, step_bias: bool, whole: Any, held: Any) -> SpringFit:

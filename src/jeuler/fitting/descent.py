@@ -40,7 +40,7 @@ def by_optax(
         raise ValueError("scale must be finite and greater than 0")
     descent: Descent | Minibatches = Descent(options.optimizer, evaluate, task, unit, options.tolerance, watch)
     if options.minibatch is not None:
-        descent = Minibatches(descent, problem, options.minibatch)
+        descent = Minibatches(descent, problem.windows or problem, options.minibatch)
     best = descent.run(x, problem.stages, options.max_iterations)
     history = descent.history
     if not history or not np.isfinite(min(history)):

@@ -105,7 +105,7 @@ class Forward:
         self, x: np.ndarray, data: dict[str, Any], directions: np.ndarray, nodes: Any, parts: int
     ) -> tuple[Any, Any]:
         """The motion by component at the rows that are kept, and its changes in each direction."""
-        arrays, rest = partition({name: data[name] for name in ("scene", "state", "dt", "t0")}, is_array)
+        arrays, rest = partition({name: data[name] for name in ("scene", "state", "dt", "t0", "key")}, is_array)
         row, _ = nodes
         return _compiled(self, rest)(x, arrays, row, np.int32(self.prediction.num_steps * parts), directions)
 
@@ -140,6 +140,7 @@ class Forward:
                 num_steps=prediction.num_steps,
                 t0=data["t0"],
                 step=in_a_loop(prediction.step),
+                key=data["key"],
             )
 
         if prediction.step is rk4_step and not data["scene"].effects and data["state"].alive is None:

@@ -10,6 +10,7 @@ import zipfile
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core.files import check_output, write_atomically
@@ -36,7 +37,7 @@ class Record:
         check_output(path)
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves(problem):
-            digest.update(np.asarray(leaf).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
+            digest.update(np.asarray(_numbers(leaf)).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
         return cls(os.fspath(path), digest.hexdigest())
 
     def save(self, stage: int, state: Any, history: list[float]) -> None:
@@ -69,3 +70,8 @@ class Record:
                 return int(kept["_stage"]), state, kept["_history"].tolist()
         except (zipfile.BadZipFile, KeyError, EOFError, OSError):
             raise ValueError(f"resume={self.path!r} is not the state of a fit; give another path") from None
+
+
+def _numbers(leaf: Any) -> Any:
+    """An array of numbers; those of a key of ``jax.random``."""
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf

@@ -26,6 +26,7 @@ class Minibatches:
     def __init__(self, descent: Any, problem: Problem, size: int):
         self.descent: Any = descent
         self.data: Any = problem.data
+        self.weights: Any = np.asarray(problem.weights, float)
         self.size: int = size
         self.rows: int = _rows_of(problem, size)
         rows, scale, residual = self.rows, jnp.asarray(descent.unit), problem.residual
@@ -58,7 +59,7 @@ class Minibatches:
     def run(self, x: np.ndarray, stages: Sequence[np.ndarray], max_iterations: int) -> np.ndarray:
         """Passes over the data: the best point over everything after one of them."""
         descent, passes = self.descent, -(-self.rows // self.size)
-        weights, draw = descent.task.all_weights, np.random.default_rng(0)
+        weights, draw = self.weights, np.random.default_rng(0)
         z = jnp.asarray(x / descent.unit)
         descent.best, descent.least = z, np.inf
         state, damping, since, order = descent.init(z), 1.0, 0, np.zeros(0, int)
@@ -93,7 +94,7 @@ class Minibatches:
     def _look(self, z: Any) -> bool:
         """Whether the loss over everything is finite; it is counted then."""
         weights = self.descent.task.all_weights
-        total = float(self.descent.losses(z, self.data, weights, weights)[1])
+        total = float(self.descent.losses(z, self.descent.task.data, weights, weights)[1])
         if not np.isfinite(total):
             self.descent.nonfinite += 1
             return False

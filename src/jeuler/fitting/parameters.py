@@ -1,4 +1,4 @@
-"""The parameters of a scene and its state by name: "ks", "forces[1].ks", "velocity", "anchors"."""
+"""The parameters of a scene and its state by name: "ks", "forces[1].ks", "restitution", "velocity", "anchors"."""
 
 from __future__ import annotations
 
@@ -20,17 +20,35 @@ from jeuler.particles.state import ParticleState
 
 STATE_PARAMETERS = ("mass", "velocity", "position", "anchors")
 WHERE = "where"  # the name of what a function of the scene picks
+MOST = {"restitution": 1.0}  # what no fit may exceed, by its meaning
+
+
+def parts_of(scene: Scene) -> tuple[Any, ...]:
+    """What a name of the scene may speak of: its forces, then its effects."""
+    return (*scene.forces, *scene.effects)
 
 
 def owners_of(scene: Scene, name: str) -> tuple[list[int], str]:
-    """Which forces a name speaks of, and its field: "ks" of the springs first, "forces[1].ks" of one force."""
-    one = re.fullmatch(r"forces\[(\d+)\]\.(\w+)", name)
-    field = one.group(2) if one else name
-    owners = [k for k, force in enumerate(scene.forces) if field in parameters_of(force)]
+    """Which of `parts_of` a name speaks of, and its field: "ks" of the springs first, then of forces, then of effects.
+
+    "forces[1].ks" and "effects[0].restitution" speak of one.
+    """
+    one = re.fullmatch(r"(forces|effects)\[(\d+)\]\.(\w+)", name)
+    field = one.group(3) if one else name
+    owners = [k for k, part in enumerate(parts_of(scene)) if field in parameters_of(part)]
     if one is not None:
-        return [k for k in owners if k == int(one.group(1))], field
-    springs = [k for k in owners if isinstance(scene.forces[k], Springs)]
-    return springs or owners, field
+        number = int(one.group(2)) + (len(scene.forces) if one.group(1) == "effects" else 0)
+        within = one.group(1) == "effects" or number < len(scene.forces)
+        return [k for k in owners if k == number and within], field
+    forces = [k for k in owners if k < len(scene.forces)]
+    springs = [k for k in forces if isinstance(scene.forces[k], Springs)]
+    return springs or forces or owners, field
+
+
+def _spoken(scene: Scene, owner: int) -> str:
+    """The name of one of `parts_of`."""
+    count = len(scene.forces)
+    return f"forces[{owner}]" if owner < count else f"effects[{owner - count}]"
 
 
 def values_of_springs(scene: Scene, field: str) -> Any:
@@ -101,7 +119,8 @@ class Places:
         for name in self.names:
             owners, field = owners_of(scene, name)
             if owners:
-                values = tuple(jnp.asarray(getattr(scene.forces[k], field), state.position.dtype) for k in owners)
+                parts = parts_of(scene)
+                values = tuple(jnp.asarray(getattr(parts[k], field), state.position.dtype) for k in owners)
                 start[name] = values if len(values) > 1 else values[0]
             elif name not in STATE_PARAMETERS:
                 raise ValueError(
@@ -142,42 +161,55 @@ class Places:
             for owner in owners:
                 if (owner, field) in seen:
                     raise ValueError(
-                        f"parameters names forces[{owner}].{field} twice, as {seen[owner, field]!r} and {name!r}; "
-                        f"leave one out"
+                        f"parameters names {_spoken(scene, owner)}.{field} twice, as {seen[owner, field]!r} and "
+                        f"{name!r}; leave one out"
                     )
                 seen[owner, field] = name
 
     def put(self, scene: Scene, state: ParticleState, params: dict[str, Any]) -> tuple[Scene, ParticleState]:
         """Scene and state with the parameters put in."""
         params = self.expanded(params)
-        forces = list(scene.forces)
         if self.where is not None:
             import equinox
 
             scene = equinox.tree_at(self.where, scene, params[WHERE])
-            forces = list(scene.forces)
+        parts = list(parts_of(scene))
         for name in self.names:
             value = params[name]
             owners, field = owners_of(scene, name)
             for k, x in zip(owners, value if len(owners) > 1 else (value,), strict=False):
-                forces[k] = replace(forces[k], **{field: x})
+                parts[k] = replace(parts[k], **{field: x})
             if not owners and name == "mass" and not value.ndim:
                 state = replace(state, mass=value)
             elif not owners:
                 field = "position" if name == "anchors" else name
                 state = replace(state, **{field: getattr(state, field).at[self.rows(name)].set(value)})
-        return replace(scene, forces=tuple(forces)), state
+        count = len(scene.forces)
+        return replace(scene, forces=tuple(parts[:count]), effects=tuple(parts[count:])), state
 
     def positive(self, scene: Scene) -> dict[str, bool]:
         """Which of the parameters must not be negative."""
         found = {}
         for name in self.names:
             owners, field = owners_of(scene, name)
-            found[name] = name == "mass" or (bool(owners) and parameters_of(scene.forces[owners[0]])[field])
+            found[name] = name == "mass" or (bool(owners) and parameters_of(parts_of(scene)[owners[0]])[field])
         return found | ({WHERE: False} if self.where is not None else {})
+
+    def bounds(self, scene: Scene, given: Any) -> Any:
+        """The bounds that the user gave, within those that follow from the meaning of a parameter."""
+        if given is not None and not isinstance(given, dict):
+            return given
+        fields = {name: owners_of(scene, name) for name in self.names}
+        found = dict(given or {})
+        for name, (owners, field) in fields.items():
+            pair = found.get(name, (None, None))
+            if owners and field in MOST and isinstance(pair, (tuple, list)) and len(pair) == 2:
+                most = MOST[field] if pair[1] is None else np.minimum(pair[1], MOST[field])
+                found[name] = (pair[0], most)
+        return found or None
 
 
 def _known(scene: Scene) -> list[str]:
     """The names that a scene offers."""
-    plain = sorted(set().union(*(parameters_of(force) for force in scene.forces)))
+    plain = sorted(set().union(*(parameters_of(part) for part in parts_of(scene))))
     return [*plain, *STATE_PARAMETERS]

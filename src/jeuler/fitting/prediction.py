@@ -20,6 +20,7 @@ from jeuler.fitting.unknowns import Layout
 from jeuler.particles._simulate import simulate
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
+from jeuler.solving.grid import Checkpoint
 from jeuler.steps.explicit import Step
 
 
@@ -39,11 +40,13 @@ class Prediction:
     step: Step
     num_steps: int
     columns: tuple[int, ...]  # of position.ravel(), those that were observed
+    checkpoint: Checkpoint = None
 
     def positions(self, params: dict[str, Any], data: dict[str, Any]) -> Array:
         """Positions of all particles at the times, (time, particle, dim), m."""
         scene, state = self.places.put(data["scene"], data["state"], params)
-        p, v = motion(scene, state, dt=data["dt"], num_steps=self.num_steps, t0=data["t0"], step=self.step)
+        how: dict[str, Any] = {"num_steps": self.num_steps, "step": self.step, "checkpoint": self.checkpoint}
+        p, v = motion(scene, state, dt=data["dt"], t0=data["t0"], key=data["key"], **how)
         k, s = data["interval"], data["fraction"].astype(p.dtype)[:, None, None]
         return hermite(s, data["dt"].astype(p.dtype), p[k], p[k + 1], v[k], v[k + 1])
 
@@ -67,7 +70,16 @@ class Prediction:
 
 
 def recording(
-    scene: Scene, state: ParticleState, times: Any, targets: Any, columns: Any, *, dt: float, t0: float, num_steps: int
+    scene: Scene,
+    state: ParticleState,
+    times: Any,
+    targets: Any,
+    columns: Any,
+    *,
+    dt: float,
+    t0: float,
+    num_steps: int,
+    key: Any = None,
 ) -> dict[str, Any]:
     """The data of a `Prediction`."""
     interval, fraction = place_in_steps(np.asarray(times), t0, dt, num_steps)
@@ -78,6 +90,7 @@ def recording(
         "state": state,
         "dt": np.asarray(dt, float),
         "t0": np.asarray(t0, float),
+        "key": key,
         "interval": interval,
         "fraction": fraction,
         "targets": xp.where(xp.isfinite(seen), seen, 0),

@@ -122,7 +122,11 @@ def residual_weights(layout: Layout, sigma: PyTree, weights: PyTree) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A residual with its data, weights, bounds and start, checked."""
+    """A residual with its data, weights, bounds and start, checked.
+
+    Attributes:
+      windows: the same unknowns with parts of the data as rows, for minibatches; None: the data's own rows.
+    """
 
     residual: FlatResidual
     form: Layout  # of what the residual returns
@@ -134,6 +138,7 @@ class Problem:
     absolute: bool
     stages: tuple[Any, ...]
     closes_over_traced: bool = False
+    windows: Problem | None = None
 
     @classmethod
     def of(

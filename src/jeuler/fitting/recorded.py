@@ -30,12 +30,15 @@ from jeuler.fitting.problem import Problem
 from jeuler.fitting.sampling import aliased
 from jeuler.fitting.series import Columns, Series, column_names
 from jeuler.fitting.smoothness import alike_neighbours
-from jeuler.fitting.step_bias import bias_of_step
+from jeuler.fitting.step_bias import RANDOM, bias_of_step
 from jeuler.fitting.two_starts import from_both
 from jeuler.fitting.unknowns import Layout
 from jeuler.fitting.weak_form import weak_form
+from jeuler.fitting.windows import in_windows
+from jeuler.particles.fields import draws
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
+from jeuler.solving.grid import Checkpoint
 from jeuler.steps.explicit import Step
 
 POOR = 0.9  # share explained below which units and origins are looked at
@@ -53,6 +56,7 @@ class Recorded:
     dt: float
     prediction: Prediction
     start: dict[str, Any]
+    key: Any = None
 
     @classmethod
     def of(
@@ -69,6 +73,8 @@ class Recorded:
         names: Any,
         where: Any,
         ties: Any = None,
+        key: Any = None,
+        checkpoint: Checkpoint = None,
     ) -> Recorded:
         """Checked, or one ValueError."""
         checks.kind("scene", scene, Scene)
@@ -97,8 +103,8 @@ class Recorded:
         places = Places.of(state, names, where, ties, scene)
         flat = targets.reshape(len(times), -1)
         observed = np.arange(flat.shape[1]) if checks.is_traced(targets) else np.isfinite(flat).any(axis=0).nonzero()[0]
-        prediction = Prediction(places, step, num_steps, tuple(observed.tolist()))
-        return cls(scene, state, times, targets, float(t0), float(dt), prediction, places.read(scene, state))
+        prediction = Prediction(places, step, num_steps, tuple(observed.tolist()), checkpoint)
+        return cls(scene, state, times, targets, float(t0), float(dt), prediction, places.read(scene, state), key)
 
     @property
     def data(self) -> dict[str, Any]:
@@ -112,6 +118,7 @@ class Recorded:
             dt=self.dt,
             t0=self.t0,
             num_steps=self.prediction.num_steps,
+            key=self.key,
         )
 
     @property
@@ -158,7 +165,7 @@ class Recorded:
             self.prediction,
             start,
             data=data,
-            bounds=bounds,
+            bounds=self.prediction.places.bounds(self.scene, bounds),
             positive=self.prediction.places.positive(self.scene),
             sigma=sigma,
             weights=weights,
@@ -178,11 +185,14 @@ class Recorded:
         grow: bool,
         priors: Any = None,
         smoothness: Any = None,
+        window: int | None = None,
     ) -> tuple[Outcome, str]:
         """Search from the data and, where that is not good, from the scene's values; the better, and its start."""
-        stages = self._stages() if grow else ()
+        stages = self._stages() if grow and options.minibatch is None else ()
         alike = alike_neighbours(self.scene, self.prediction.places, smoothness)
         given = self.problem(self.start, bounds, sigma, weights, stages, priors, options.loss, alike)
+        if options.minibatch is not None:
+            given = dataclasses.replace(given, windows=in_windows(given, self, window))
         if self.traced:
             return run(given, options), "given"
         known, scale = self._known(given), self._scale()
@@ -256,7 +266,9 @@ class Recorded:
         words = aliased(self.scene, scene, state, self.times)
         if found.explained is not None and found.explained < POOR:
             words += mismatched(self.scene, self.state, self.times, self.targets, self.t0)
-        if step_bias and found.covariance is not None and outcome.state is not None:
+        if step_bias and any(draws(effect, self.key) for effect in scene.effects):
+            words = [*words, RANDOM]
+        elif step_bias and found.covariance is not None and outcome.state is not None:
             bias, more = bias_of_step(self, found, outcome.state)
             words = [*words, *more]
         fields["message"] = "; ".join([fields["message"], *words])

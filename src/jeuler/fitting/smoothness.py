@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jeuler._core import checks
-from jeuler.fitting.parameters import Places, owners_of
+from jeuler.fitting.parameters import Places, owners_of, parts_of
 from jeuler.fitting.priors import Alike
 from jeuler.forces.springs import Springs
 from jeuler.particles.scene import Scene
@@ -39,7 +39,8 @@ def _pairs(scene: Scene, places: Places, name: str) -> np.ndarray:
     owners, field = owners_of(scene, name)
     ends, numbers, first = [], [], 0
     for owner in owners:
-        force, size = scene.forces[owner], np.size(getattr(scene.forces[owner], field))
+        force = parts_of(scene)[owner]
+        size = np.size(getattr(force, field))
         if isinstance(force, Springs) and np.ndim(getattr(force, field)):
             ends.append(np.asarray(force.edges[:]))
             numbers.append(first + np.arange(size))

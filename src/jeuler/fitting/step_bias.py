@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from jeuler.fitting.recorded import Recorded
 
 TENTH = 0.1  # of a standard error: the least that is worth a word
+RANDOM = "the run draws random numbers in each step, so the bias of the step is not known"
 
 
 def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[str]]:
@@ -71,7 +72,15 @@ def _residuals(task: Recorded, layout: Layout, found: Fit) -> tuple[np.ndarray, 
     steps = task.prediction.num_steps * 2
     x, columns = np.asarray(layout.vector(found.params), float), task.prediction.columns
     halved = recording(
-        task.scene, task.state, task.times, task.targets, columns, dt=task.dt / 2, t0=task.t0, num_steps=steps
+        task.scene,
+        task.state,
+        task.times,
+        task.targets,
+        columns,
+        dt=task.dt / 2,
+        t0=task.t0,
+        num_steps=steps,
+        key=task.key,
     )
     forward = Forward.of(task.prediction, layout, task.data)
     return forward.residual_at(x, task.data)[0], forward.residual_at(x, halved, parts=2)[0]

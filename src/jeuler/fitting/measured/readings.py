@@ -21,6 +21,7 @@ from jeuler.fitting.prediction import motion
 from jeuler.observing import Sensor
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
+from jeuler.solving.grid import Checkpoint
 from jeuler.steps.explicit import Step
 
 SENSOR_PARAMETERS = ("delay", "gain", "bias")
@@ -62,6 +63,7 @@ class Readings:
     groups: tuple[Group, ...]
     periods: tuple[float | None, ...]
     numbers: int
+    checkpoint: Checkpoint = None
 
     @property
     def haste(self) -> Haste:
@@ -99,8 +101,8 @@ class Readings:
         """The readings of one recording, (time, ...)."""
         scene, state = self.places.put(data["scene"], data["state"], params)
         sensor = replace(data["sensor"], **{name: params[name] for name in self.of_sensor})
-        step = in_a_loop(self.step)
-        moved = motion(scene, state, dt=data["dt"], num_steps=num_steps, t0=data["t0"], step=step)
+        how: dict[str, Any] = {"num_steps": num_steps, "step": in_a_loop(self.step), "checkpoint": self.checkpoint}
+        moved = motion(scene, state, dt=data["dt"], t0=data["t0"], key=data["key"], **how)
         return read(sensor, scene, state, moved, data, num_steps)
 
     def __call__(self, params: dict[str, Any], data: Sequence[dict[str, Any]]) -> tuple[Array, ...]:

@@ -33,11 +33,13 @@ from jeuler.fitting.problem import Problem
 from jeuler.fitting.result import Fit
 from jeuler.fitting.series import Columns, Series, column_names, one_after_another
 from jeuler.fitting.smoothness import alike_neighbours
-from jeuler.fitting.step_bias import shifted
+from jeuler.fitting.step_bias import RANDOM, shifted
 from jeuler.fitting.two_starts import from_both
 from jeuler.fitting.weak_form import weak_form
+from jeuler.particles.fields import draws
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
+from jeuler.solving.grid import Checkpoint
 from jeuler.steps.explicit import Step
 
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of its span that is fitted in each stage
@@ -58,6 +60,7 @@ class Several:
     dt: float
     single: bool
     bounds: dict[str, Any]
+    key: Any = None
 
     @classmethod
     def of(
@@ -78,6 +81,8 @@ class Several:
         bounds: Any,
         sigma: Any,
         weights: Any,
+        key: Any = None,
+        checkpoint: Checkpoint = None,
     ) -> Several:
         """Checked, or one ValueError."""
         checks.kind("scene", scene, Scene)
@@ -102,8 +107,8 @@ class Several:
         periods = tuple(period_of(records[g.members[0]].sensor) for g in groups)
         unknowns = sum(np.size(leaf) for leaf in jax.tree.leaves(start))
         numbers = sum(len(g.members) * g.num_steps for g in groups) * records[0].state.position.size * unknowns
-        residual = Readings(places, of_sensor, own, step, groups, periods, numbers)
-        return cls(scene, records, residual, start, float(dt), single, bounds)
+        residual = Readings(places, of_sensor, own, step, groups, periods, numbers, checkpoint)
+        return cls(scene, records, residual, start, float(dt), single, places.bounds(scene, bounds), key)
 
     @property
     def traced(self) -> bool:
@@ -115,7 +120,8 @@ class Several:
         found = []
         for group in self.residual.groups:
             count = max(group.lengths)
-            each = [self.records[k].data(self.dt / parts, group.num_steps * parts, count) for k in group.members]
+            steps = group.num_steps * parts
+            each = [{**self.records[k].data(self.dt / parts, steps, count), "key": self.key} for k in group.members]
             found.append(jax.tree.map(stacked, *each))
         return found
 
@@ -287,7 +293,9 @@ class Several:
         fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
         scene, _ = self.residual.places.put(self.scene, self.records[0].state, self._first(found))
         states, predicted, bias = tuple(self.states(found.params)), tuple(self.predicted(found.params)), None
-        if step_bias and found.covariance is not None and outcome.state is not None:
+        if step_bias and any(draws(effect, self.key) for effect in scene.effects):
+            fields["message"] = "; ".join([fields["message"], RANDOM])
+        elif step_bias and found.covariance is not None and outcome.state is not None:
             whole = self._off(predicted)
             bias, more = shifted(whole, self._in_halves(found), self.dt, self.residual.step, found, outcome.state)
             fields["message"] = "; ".join([fields["message"], *more])
