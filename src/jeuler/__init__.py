@@ -55,7 +55,7 @@ from jeuler.forces import (
     strand_edges,
     turbulence,
 )
-from jeuler.particles import ParticleState, Scene, empty_pool, export, simulate, uses
+from jeuler.particles import Division, ParticleState, Scene, divide, empty_pool, export, simulate, uses
 from jeuler.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, FromSurface, Normal, Uniform
 from jeuler.solving import AdaptiveSolution, Ensemble, Moments, Quantiles, Solution, ensemble, solve, solve_adaptive
 from jeuler.steps import (
@@ -125,6 +125,7 @@ __all__ = [
     "DeathOutside",
     "Diagnosis",
     "DistanceLinks",
+    "Division",
     "DryFriction",
     "Emitter",
     "Ensemble",
@@ -184,6 +185,7 @@ __all__ = [
     "cap_cotangent",
     "compare_fits",
     "diagnose",
+    "divide",
     "empty_pool",
     "ensemble",
     "euler_step",

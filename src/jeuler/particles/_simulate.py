@@ -17,6 +17,8 @@ from jeuler._core.limits import check_parameters
 from jeuler._jax import programs
 from jeuler._jax.haste import Haste
 from jeuler.contact.collisions import has_long_code
+from jeuler.graphs.partition import Partition
+from jeuler.particles.divided import check_division, run_divided
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import START, acts, draws, name_of, needs, with_required_fields
 from jeuler.particles.protocols import Context
@@ -52,6 +54,7 @@ def simulate(
     progress: Progress = None,
     resume: Any = None,
     checkpoint_every: int | None = None,
+    mesh: Any = None,
 ) -> Solution:
     """Run a scene: num_steps steps of its equation of motion and its effects, in one ``lax.scan``.
 
@@ -79,6 +82,9 @@ def simulate(
       progress: a bar, or a function to call, as in `solve`.
       resume: path of a folder that keeps the run, as in `solve`.
       checkpoint_every: steps between two states on disk, as in `solve`.
+      mesh: a ``jax.sharding.Mesh``: the particles of this one scene are divided over all its devices, which send each
+        other the positions and velocities of those at their borders at each evaluation of the forces; `divide` tells
+        which scenes can be divided, and what is sent. Explicit steps only; ``save`` is done at the end, on all frames.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -97,6 +103,11 @@ def simulate(
     grid = check_run(scene, state, dt, num_steps, t0, save_every, key, checkpoint, many=can_be_in_chunks(checkpoint))
     checks.true_or_false("compensated", compensated)
     inputs = scene, state, grid, key, Function(step), Function(save)
+    if mesh is not None:
+        how = {"windows": windows, "progress": progress, "resume": resume, "key": key}
+        parts = check_division(scene, state, mesh, step, checkpoint, how)
+        divided = scene, state, grid, parts, Function(step), Function(save)
+        return programs.call(_simulate_divided, divided, (checkpoint, compensated, mesh))
     if not isinstance(windows, (str, tuple, list)):
         came = checks.shown(windows)
         raise ValueError(f'windows must be "auto" or a tuple of sizes, got {came}; write windows=({came},)')
@@ -117,6 +128,30 @@ def _haste(scene: Scene) -> Haste:
 def _simulate(*given: Any) -> Solution:
     """`simulate`, as it is compiled in one piece."""
     return Solution(*in_one_scan(_loop(*given)))
+
+
+def _simulate_divided(
+    scene: Scene,
+    state: ParticleState,
+    grid: Grid,
+    parts: Partition,
+    stepper: Function,
+    saver: Function,
+    checkpoint: Checkpoint,
+    compensated: bool,
+    mesh: Any,
+) -> Solution:
+    """`simulate` over the devices of a mesh."""
+    check_save(saver.function)
+
+    def run(scene, state, grid):
+        loop = _loop(scene, state, grid, None, stepper, Function(None), checkpoint, compensated, ())
+        return in_one_scan(loop)[:3]
+
+    t, y, first_nonfinite = run_divided(run, scene, state, grid, parts, mesh)
+    if saver.function is not None:
+        y = jax.vmap(saver.function)(t, y)
+    return Solution(t, y, first_nonfinite, jnp.int32(0))
 
 
 def _loop(

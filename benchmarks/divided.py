@@ -1,0 +1,105 @@
+"""One cloth over eight devices that JAX makes of this machine's cores, beside the same on one.
+
+python benchmarks/divided.py cloth 512 [STEPS]        forward and gradient: differences, bytes sent, seconds
+python benchmarks/divided.py scaling 64               weak and strong scaling over 1 to 8 devices, of forward runs
+"""
+
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jeuler
+from jeuler.scenes.shapes import Body, rows
+
+
+def sheet(long: int, wide: int) -> Body:
+    """A level sheet of long x wide particles, 1 mm apart, joined along its threads and across its meshes."""
+    g = np.arange(long * wide).reshape(long, wide)
+    x, y = np.meshgrid(1e-3 * np.arange(long), 1e-3 * np.arange(wide), indexing="ij")
+    edges = [rows(g[:-1], g[1:]), rows(g[:, :-1], g[:, 1:]), rows(g[:-1, :-1], g[1:, 1:]), rows(g[:-1, 1:], g[1:, :-1])]
+    lines = [rows(g[:-2], g[1:-1], g[2:]), rows(g[:, :-2], g[:, 1:-1], g[:, 2:])]
+    place = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    return Body(place, np.concatenate(edges), np.zeros((0, 3), int), np.concatenate(lines))
+
+
+def problem(long: int, wide: int, num_steps: int, mesh=None):
+    """The scene and state, and the function of (ks, position) that runs it."""
+    body, noise = sheet(long, wide), np.random.default_rng(0)
+    x = jnp.asarray(body.position + 1e-5 * noise.normal(size=body.position.shape), jnp.float32)
+    mass = jnp.full(len(x), 1e-3, jnp.float32).at[0].set(jnp.inf)
+    state = jeuler.ParticleState(x, jnp.zeros_like(x), mass=mass)
+    ks = jnp.full(len(body.edges), 20.0, jnp.float32)
+
+    def scene(ks):
+        ball = jeuler.PenaltyContact(jeuler.Sphere([0.2, 0.2, -0.1], 0.0999), ks=10.0)
+        links = jeuler.Springs(body.edges, ks, 1e-3, body.length), jeuler.Bending(body.lines, 1e-9)
+        return jeuler.Scene((*links, jeuler.Gravity([0.0, 0.0, -9.8]), jeuler.LinearDrag(1e-4), ball))
+
+    def end(ks, x):
+        how = {"dt": 1e-4, "num_steps": num_steps, "save_every": num_steps, "step": jeuler.symplectic_euler_step}
+        y = jeuler.simulate(scene(ks), state.replace(position=x), **how, mesh=mesh).y.position[-1]
+        return jnp.sum(y**2), y
+
+    return scene(ks), state, ks, end
+
+
+def timed(function, *given):
+    jax.block_until_ready(function(*given))
+    start = time.perf_counter()
+    found = jax.block_until_ready(function(*given))
+    return found, time.perf_counter() - start
+
+
+def cloth(side: int, num_steps: int = 10) -> None:
+    found = []
+    for mesh in (None, jax.make_mesh((8,), ("device",))):
+        scene, state, ks, end = problem(side, side, num_steps, mesh)
+        function = jax.jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))
+        ((_, y), gradient), seconds = timed(function, ks, state.position)
+        print(
+            f"{'undivided' if mesh is None else '8 devices'}: value and gradient of {num_steps} steps {seconds:.2f} s"
+        )
+        found.append((y, *gradient))
+    for name, a, b in zip(("positions", "by ks", "by position"), *found, strict=True):
+        print(f"{name:12s} differ by {float(jnp.abs(a - b).max() / jnp.abs(a).max()):.1e} of the largest")
+    print(jeuler.divide(scene, state, devices=8))
+    print(f"on paper: {2 * side * 7 * 2 * 6 * 4:,} bytes")
+
+
+def scaling(rows_each: int) -> None:
+    for devices in (1, 2, 4, 8):
+        flags = f"--xla_force_host_platform_device_count={devices}"
+        for kind, long in (("weak", rows_each * devices), ("strong", 8 * rows_each)):
+            command = [sys.executable, __file__, "on", kind, str(devices), str(long)]
+            subprocess.run(command, env=os.environ | {"XLA_FLAGS": flags}, check=True)
+
+
+def on(kind: str, devices: str, long: str) -> None:
+    wide, num_steps = 256, 20
+    mesh = jax.make_mesh((int(devices),), ("device",))
+    scene, state, ks, end = problem(int(long), wide, num_steps, mesh)
+    function = jax.jit(lambda *given: end(*given)[1])
+    timed(function, ks, state.position)
+    seconds = min(timed(function, ks, state.position)[1] for _ in range(3)) / num_steps
+    print(
+        f"{kind:6s} {devices} devices, {int(long) * wide:,} particles: {1e3 * seconds:.1f} ms a step, "
+        f"{1e9 * seconds / len(ks):.0f} ns a spring-step, "
+        f"{jeuler.divide(scene, state, devices=int(devices)).bytes_sent:,} bytes a step",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    task, *rest = sys.argv[1:]
+    if task == "cloth" and "force_host" not in os.environ.get("XLA_FLAGS", ""):
+        flags = "--xla_force_host_platform_device_count=8"
+        sys.exit(subprocess.run([sys.executable, *sys.argv], env=os.environ | {"XLA_FLAGS": flags}).returncode)
+    if task == "on":
+        on(*rest)
+    else:
+        {"cloth": cloth, "scaling": scaling}[task](*map(int, rest))
