@@ -232,6 +232,14 @@ def test_an_answer_is_no_accident_of_where_the_jumps_fall_on_the_grid():
     assert advice.num_steps < 390
 
 
+def test_where_only_an_error_far_below_the_target_was_found_larger_steps_are_tried():
+    f, y0, t1, end = FIELDS["jump in the state"]
+    step = jeuler.extrapolated_euler(4)
+    num_steps = advise_step(f, y0, t1=t1, error=1e-4, step=step).num_steps
+    run = Pilot(f, jnp.asarray(y0), 0.0, t1, None, step, np.float64, False)
+    assert 1e-4 / 3 < abs(run(num_steps)[-1, 0] / end - 1) <= 1e-4
+
+
 def test_an_eccentric_orbit_is_answered():
     f, y0, t0, t1, reference = more_problems()["DETEST_nonstiff_D5"]
     advice = advise_step(f, y0, t0=t0, t1=t1, error=1e-2, step=jeuler.rk4_step)
@@ -254,6 +262,23 @@ def test_few_steps_are_advised_where_few_do(step, most):
     assert advice.num_steps <= most
     run = jeuler.solve(decay, 1.0, dt=advice.dt, num_steps=advice.num_steps, step=step)
     assert abs(float(run.y[-1]) * math.e - 1) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("f", "y0", "t1", "least", "most"),
+    [
+        (lambda t, y, args: 0 * y, 2.0, 3.0, 1, 1),
+        (lambda t, y, args: -y, 0.0, 1.0, 1, 1),
+        (lambda t, y, args: 50 * y, 1.0, 10.0, 3700, 4400),  # e^500: its square is no number of float64
+    ],
+    ids=["constant", "zero", "e^500"],
+)
+@pytest.mark.filterwarnings("error")
+def test_runs_without_any_error_and_runs_that_grow_beyond_all_squares_are_advised(f, y0, t1, least, most):
+    """The relative error of RK4 on y' = k y is (k t1)^5 / (120 n^4): 4,017 steps for 1e-3, 4,248 for 0.8 of it."""
+    advice = advise_step(f, y0, t1=t1, error=1e-3, step=jeuler.rk4_step)
+    assert advice.feasible, advice.reason
+    assert least <= advice.num_steps <= most
 
 
 def test_a_scene_and_its_state_are_advised_and_effects_left_out_are_named():

@@ -108,7 +108,8 @@ def advise_step(
       t0: initial time, s.
       args: passed to f.
       step: the method.
-      relative: the target is relative to the norm of the state at t1 (True), or in the units of the state (False).
+      relative: the target is relative to the norm of the state at t1 (True; where that is 0 it is not), or in the units
+        of the state (False).
       compensated: advise for compensated sums.
       breaks: times at which f may jump, s, t0 and t1 among them, for a run with the same `solve(..., breaks=)`.
       max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work, a
@@ -229,7 +230,7 @@ class _Answer:
                 f"use {self.finer_step()} or an adaptive solver"
             )
         if error < target / FACTOR:
-            how = self.far_below(ladder.best, num_steps, target / error)
+            how = self.far_below(ladder.best, num_steps, target / error if error > 0 else math.inf)
         elif seen:
             how = "confirmed by a pilot run of that dt"
         else:
@@ -247,7 +248,8 @@ class _Answer:
         if total > search.error:
             return self.refusal(f"roundoff in {search.dtype} leaves no error below {total:.1e}", total)
         if error < search.error * search.scale(final) / FACTOR:
-            how = self.far_below(final, num_steps, search.error * search.scale(final) / error, NEAR_LIMIT_UNEVEN)
+            better = search.error * search.scale(final) / error if error > 0 else math.inf
+            how = self.far_below(final, num_steps, better, NEAR_LIMIT_UNEVEN)
         else:
             how = "confirmed by a pilot run of that dt"
         reason = (
@@ -258,6 +260,8 @@ class _Answer:
     def far_below(self, final: Any, num_steps: int, better: float, part: float = NEAR_LIMIT) -> str:
         """Why an error is far below the target: as one step fewer misses it, or as larger dts grow or jump."""
         search, smaller = self.search, f"the error is {better:.2g} times smaller than asked"
+        if math.isinf(better):
+            smaller, better = "no error is seen", 1e100
         if num_steps == 1:
             return f"one step is enough: {smaller}"
         fewer = min(math.floor(LARGER * num_steps), num_steps - 1)

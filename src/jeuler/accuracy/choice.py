@@ -25,7 +25,7 @@ from jeuler.accuracy.candidates import (
     stiff_reference,
 )
 from jeuler.accuracy.method import has_diffrax
-from jeuler.accuracy.pilot import distance
+from jeuler.accuracy.pilot import distance, norm
 from jeuler.accuracy.trials import Found, Target, Trial, cheapest, milliseconds
 from jeuler.accuracy.written import code_of
 from jeuler.steps.explicit import VectorField
@@ -175,7 +175,8 @@ def advise_method(
       error: target at t1, > 0.
       t0: initial time, s.
       args: passed to f.
-      relative: the target is relative to the norm of the state at t1 (True), or in the units of the state (False).
+      relative: the target is relative to the norm of the state at t1 (True; where that is 0 it is not), or in the units
+        of the state (False).
       breaks: times at which f may jump, s, t0 and t1 among them, as `solve` and `solve_adaptive` take them.
       methods: ``{name: method}``, steps and diffrax solvers (by tolerance where they estimate their error), or None in
         place of a method for `solve_adaptive`; None takes all steps of the library and diffrax's Euler, Heun, Tsit5
@@ -275,8 +276,7 @@ class _Ranking:
         return f"for an error of {self.error:g} use {best.name}, {how}, {steps}: {milliseconds(best.seconds)}{untried}"
 
     def scale(self, final: np.ndarray) -> float:
-        size = float(np.linalg.norm(final))
-        return size if self.relative and size > 0 else 1.0
+        return (norm(final) or 1.0) if self.relative else 1.0
 
     def reference(self) -> tuple[np.ndarray | None, float]:
         """The state at t1 by an adaptive run, where two tolerances agree; and by how much they do."""
@@ -354,7 +354,7 @@ class _Ranking:
 
 def _size(numbers: np.ndarray) -> float:
     """Root mean square."""
-    return float(np.sqrt(np.mean(numbers**2))) if numbers.size else 0.0
+    return norm(numbers) / math.sqrt(numbers.size) if numbers.size else 0.0
 
 
 def _unit(*sizes: float) -> float:

@@ -128,10 +128,20 @@ class Ladder:
     def observed_orders(self) -> np.ndarray:
         """log2 of the ratio of the errors of neighbours."""
         errors = np.maximum(self.errors(), 1e-300)
-        return np.log2(errors[:-1] / errors[1:])
+        with np.errstate(over="ignore", invalid="ignore"):  # NaN between two that are not finite
+            return np.log2(errors[:-1] / errors[1:])
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
     """Euclidean norm of the difference of two states; inf or NaN, without a warning, where one is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.linalg.norm(a - b))
+        return norm(a - b)
+
+
+def norm(x: np.ndarray) -> float:
+    """Euclidean norm, also of numbers whose squares are too large or too small."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        plain, largest = float(np.linalg.norm(x)), float(np.max(np.abs(x), initial=0.0))
+        if 1e-140 < plain < np.inf or not 0 < largest < np.inf:
+            return plain
+        return largest * float(np.linalg.norm(x / largest))

@@ -12,7 +12,7 @@ import numpy as np
 
 from jeuler._core import trees
 from jeuler._core.precision import cast, double_precision, flat, flat_rows
-from jeuler.accuracy.pilot import SAMPLES, Ladder, Pilot, distance
+from jeuler.accuracy.pilot import SAMPLES, Ladder, Pilot, distance, norm
 from jeuler.accuracy.roundoff import Rounding
 from jeuler.solving._adaptive import solve_adaptive
 from jeuler.steps.explicit import Step, VectorField
@@ -124,7 +124,7 @@ class Search:
 
     def scale(self, final: Any) -> float:
         """The unit of the target, in the units of the state."""
-        return float(np.linalg.norm(final)) if self.relative else 1.0
+        return (norm(final) or 1.0) if self.relative else 1.0
 
     def target(self, ladder: Ladder) -> float:
         """The target in the units of the state."""
@@ -181,7 +181,7 @@ class Search:
         if ladder.best is None or not np.all(np.isfinite(ladder.best)):
             return False
         target, error = self.target(ladder), ladder.errors()[-1]
-        converged = error < 1e-13 * np.linalg.norm(ladder.best)
+        converged = error <= 1e-13 * norm(ladder.best)
         falling = np.all(ladder.observed_orders()[-2:] > 0.5 * self.order) or converged
         return target > 0 and falling and ladder.doubt <= TRUST * max(target, error)
 
@@ -257,7 +257,7 @@ class Search:
                 return False
         elif ladder.error_of(self.reference.final) > known:
             return False
-        floor = 1e-12 * float(np.linalg.norm(ladder.finals[-1])) + 2 * ladder.doubt
+        floor = 1e-12 * norm(ladder.finals[-1]) + 2 * ladder.doubt
         for part in OFF:
             num_steps = round(part * finest)
             expected = error * (finest / num_steps) ** self.order
@@ -274,7 +274,7 @@ class Search:
         times = self.t0 + self.interval * np.arange(1, SAMPLES + 1) / SAMPLES
         with double_precision():
             y0, args = cast(self.start, np.float64), cast(self.args, np.float64)
-            size = max(float(np.linalg.norm(flat(y0))), 1e-3)
+            size = max(norm(flat(y0)), 1e-3)
             for step, most, words in (
                 (None, REFERENCE_STEPS, "solve_adaptive"),
                 (STIFF_STEP, STIFF_REFERENCE_STEPS, STIFF_WORDS),
@@ -301,7 +301,7 @@ class Search:
                             return Reference(times, states, words)
                         self.disagreeing = True
                     before = states[-1]
-                    size = min(size, float(np.linalg.norm(before)) or size)  # what decays is known in its own terms
+                    size = min(size, norm(before) or size)  # what decays is known in its own terms
         return None
 
     def uneven(self, final: np.ndarray, start: int = 0) -> tuple[int, float] | None:
@@ -333,9 +333,9 @@ class Search:
         if math.isinf(error_of(round(found / FINER))):
             found = self.on_edge(error_of, found)
         elif error_of(found) < 1 / FACTOR and not many:
-            between = np.linspace(max(least, found / 2), found * FINER, int(np.clip(self.most // found, *BETWEEN)))
-            near = (n for n in map(math.ceil, between) if error_of(n) >= 1 / FACTOR and meets(n))
-            found = next(near, found)
+            counts = np.linspace(max(least, found / 2), found * FINER, int(np.clip(self.most // found, *BETWEEN)))
+            do = [n for n in map(math.ceil, counts) if meets(n)]
+            found = next((n for n in do if error_of(n) >= 1 / FACTOR), min([*do, found]))
         return found, error_of(found) * self.error * self.scale(final)
 
     def on_edge(self, error_of: Callable[[int], float], high: int) -> int:

@@ -18,7 +18,7 @@ from jeuler._core.precision import cast, flat, precision
 from jeuler._jax import programs
 from jeuler.accuracy.candidates import Candidate, Problem, program, written_out
 from jeuler.accuracy.method import is_diffrax
-from jeuler.accuracy.pilot import distance
+from jeuler.accuracy.pilot import distance, norm
 from jeuler.accuracy.roundoff import COUNTER
 
 AIM = 0.95  # of the target, that the cheapest run is to meet
@@ -219,7 +219,7 @@ def predicted(runs: list[Outcome], trial: Trial, target: Target) -> Found:
     if num_steps > COUNTER:
         return nothing(runs, f"asks for {num_steps:.1e} steps, more than the clock can count")
     roundoff = 0.5 * float(np.finfo(trial.dtype).eps) * math.sqrt(num_steps)
-    if roundoff * float(np.linalg.norm(target.truth)) / target.scale > target.error:
+    if roundoff * norm(target.truth) / target.scale > target.error:
         return nothing(runs, f"asks for {num_steps:,} steps, whose roundoff in {trial.dtype} is above the target")
     error = last.error * (last.setting / num_steps) ** order
     return Found(num_steps, num_steps, error, last.seconds * num_steps / last.setting, "predicted by its order")
