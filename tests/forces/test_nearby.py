@@ -69,6 +69,32 @@ def test_a_run_and_its_gradient_are_those_of_all_pairs(random):
     assert value == truths[1]
 
 
+@pytest.mark.parametrize("step", [jeuler.rk4_step, jeuler.implicit_midpoint_step])
+def test_stages_of_a_long_step_miss_nobody(step, random):
+    """Particles move by several skins within a step, in which a method reads the forces more than once."""
+    x, v = random.uniform(-1, 1, (20, 2)), 4 * random.normal(size=(20, 2))
+    near = Neighbours(0.3, 0.02, capacity=19)
+
+    def end(scene, scale):
+        run = jeuler.simulate(scene, ParticleState(scale * x, v), dt=0.02, num_steps=6, step=step)
+        return jnp.sum(run.y.position[-1] ** 2)
+
+    def both(scene):
+        return jax.jit(jax.value_and_grad(lambda scale: end(scene, scale)))(1.0)
+
+    ours, truth = both(Scene((SoftRepulsion(near, 0.3, 50.0, 2.0),), (near,))), both(Scene((of_all_pairs,)))
+    np.testing.assert_allclose(ours, truth, rtol=1e-9)
+
+
+def test_a_row_that_is_too_short_at_a_stage_is_not_a_number():
+    """Three meet in the middle of the step alone, where a row has one place."""
+    near = Neighbours(0.3, 0.02, capacity=1)
+    x, v = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), np.array([[2.0, 0.0], [0.0, 0.0], [-2.0, 0.0]])
+    scene = Scene((SoftRepulsion(near, 0.3, 1.0),), (near,))
+    run = jeuler.simulate(scene, ParticleState(x, v), dt=1.0, num_steps=1, step=jeuler.rk4_step)
+    assert int(run.first_nonfinite) == 1
+
+
 def test_action_equals_reaction_and_a_lattice_has_its_density(random):
     near = Neighbours(0.15, 0.05, capacity=60)
     fluid = Fluid(near, mass=0.01, density=0.5, stiffness=9.0, viscosity=0.1)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
 from jeuler._core import checks
 from jeuler._core.annotations import OptionalParameter, Parameter, default
 from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import component, store_as_float
 from jeuler._core.limits import check_limits
+from jeuler._jax.anywhere import anywhere
 from jeuler.graphs.cells import NOT_BUILT, nearest_image, rows_of_neighbours
 from jeuler.particles.fields import START
 from jeuler.particles.state import FieldForm
@@ -25,10 +28,11 @@ class Neighbours:
         j is in the row of i where |p_i - p_j| < cutoff + skin; rows are made again when a particle has moved skin / 2
 
     The state holds the rows, ``neighbours`` (particle, capacity), -1 for none, and counts in ``missed_neighbours``
-    those that found no place, in a row or in a cell, over all times that rows were made: 0 where nothing was
-    missed. Rows are made at the ends of steps: in a step in which a particle moves by more than skin / 2, a method
-    of several stages may miss one. Which pairs are near has no derivative; forces that are 0 at the cutoff have the
-    right one. Under ``jax.vmap`` rows are made at each step.
+    those that found no place, in a row or in a cell, over all ends of steps at which rows were made: 0 where nothing
+    was missed. Where a force is read of positions that are farther than skin / 2 from those of the rows, as at a stage
+    within a long step, it makes rows of its own there; if one of these finds no place for all, the force is NaN. Which
+    pairs are near has no derivative; forces that are 0 at the cutoff have the right one. Under ``jax.vmap`` rows are
+    made again in all members where one member needs it.
 
     Args:
       cutoff: (), m, the distance up to which forces act.
@@ -79,23 +83,50 @@ class Neighbours:
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
-        dtype = state.position.dtype
-        x = lax.stop_gradient(state.position)
-        box = None if self.box is None else lax.stop_gradient(self.box.astype(dtype))
-        reach, skin = (lax.stop_gradient(one.astype(dtype)) for one in (self.cutoff + self.skin, self.skin))
+        x = state.position
         alive = jnp.ones(len(x), bool) if state.alive is None else state.alive
-        moved = jnp.sum(nearest_image(x - state.neighbours_made_at, box) ** 2, axis=1) > (skin / 2) ** 2
-        is_old = jnp.any(alive & (moved | ~state.has_neighbours))
+        is_old = self._has_moved(x, state.neighbours_made_at, alive) | jnp.any(alive & ~state.has_neighbours)
 
-        def make(_):
-            rows, missed = rows_of_neighbours(x, state.alive, reach, self.capacity, int(self.cell_capacity or 1), box)
-            return rows, x, alive, state.missed_neighbours + missed
-
-        def keep(_):
-            return state.neighbours, state.neighbours_made_at, state.has_neighbours, state.missed_neighbours
+        def make(before):
+            rows, missed = self._made(x, state.alive)
+            return rows, lax.stop_gradient(x), alive, before[3] + missed
 
         names = "neighbours", "neighbours_made_at", "has_neighbours", "missed_neighbours"
-        return state.replace(**dict(zip(names, lax.cond(is_old, make, keep, None), strict=True)))
+        made = _where(is_old, make, tuple(getattr(state, name) for name in names))
+        return state.replace(**dict(zip(names, made, strict=True)))
+
+    def rows_at(self, x: Array, rows: Array, made_at: Array, has: Array, alive: Array | None) -> Array:
+        """The rows for these positions: those made at others, or new ones where a particle is too far from there.
+
+        Those of `NOT_BUILT` where new ones cannot hold all.
+        """
+        is_old = self._has_moved(x, made_at, has if alive is None else has & alive)
+
+        def make(_):
+            rows, missed = self._made(x, alive)
+            return jnp.where(missed > 0, NOT_BUILT, rows)
+
+        return _where(is_old, make, rows)
+
+    def _has_moved(self, x: Array, made_at: Array, which: Array) -> Array:
+        """Whether one of these particles is farther than skin / 2 from where the rows were made."""
+        x, (box, _, skin) = lax.stop_gradient(x), self._sizes(x.dtype)
+        moved = jnp.sum(nearest_image(x - lax.stop_gradient(made_at), box) ** 2, axis=1)
+        return jnp.any(which & (moved > (skin / 2) ** 2))
+
+    def _made(self, x: Array, alive: Array | None) -> tuple[Array, Array]:
+        box, reach, _ = self._sizes(x.dtype)
+        return rows_of_neighbours(lax.stop_gradient(x), alive, reach, self.capacity, int(self.cell_capacity or 1), box)
+
+    def _sizes(self, dtype: Any) -> tuple[Any, Array, Array]:
+        """The box, cutoff + skin, and the skin."""
+        return lax.stop_gradient(
+            (
+                None if self.box is None else self.box.astype(dtype),
+                (self.cutoff + self.skin).astype(dtype),
+                self.skin.astype(dtype),
+            )
+        )
 
     def check(self, particles: int, dim: int) -> None:
         if dim > 3:
@@ -110,3 +141,12 @@ class Neighbours:
                     f"Neighbours.box must be at least 3 (cutoff + skin) = {least:g} m long on each side, "
                     f"got {np.asarray(self.box).tolist()}; take a smaller cutoff or skin"
                 )
+
+
+def _where(needed: Array, make: Callable[[Any], Any], before: Any) -> Any:
+    """make(before) where needed, (), else what was before; in a batch nothing is made where no member needs it."""
+
+    def made(before):
+        return jax.tree.map(lambda new, old: jnp.where(needed, new, old), make(before), before)
+
+    return lax.cond(anywhere(needed), made, lambda before: before, before)

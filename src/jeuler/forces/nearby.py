@@ -49,7 +49,7 @@ class _Nearby:
     neighbours: Any
     alive: Any
 
-    reads: ClassVar[tuple[str, ...]] = ("neighbours", "has_neighbours")
+    reads: ClassVar[tuple[str, ...]] = ("neighbours", "neighbours_made_at", "has_neighbours")
 
     def _store(self, *names: str) -> None:
         name = type(self).__name__
@@ -73,9 +73,13 @@ class _Nearby:
         velocity: Array,
         mass: Array,
         neighbours: Array,
+        neighbours_made_at: Array | None = None,
         has_neighbours: Array | None = None,
     ) -> Array:
         """The sum of what the neighbours exert; NaN where rows were never made."""
+        if neighbours_made_at is not None and has_neighbours is not None:
+            at = neighbours_made_at, has_neighbours, self.alive
+            neighbours = self.neighbours.rows_at(position, neighbours, *at)
         pairs = self._pairs(position, neighbours, has_neighbours)
         shares = self._shares(pairs, position, split(velocity), mass)
         total = stack([pairs.sum(share) for share in shares])
@@ -115,8 +119,9 @@ class SoftRepulsion(_Nearby):
       diameter: s, (), m: the distance at which two touch. Differentiable.
       ks: (), N/m. Differentiable.
       kd: (), N s/m. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass, neighbours, has_neighbours)``, (particle, dim), N; NaN
-      where the state's rows were never made, as outside of a run. A newborn has its row from its second step on.
+    Returns: called as a force ``(t, position, velocity, mass, neighbours, neighbours_made_at, has_neighbours)``,
+      (particle, dim), N; NaN where the state's rows were never made, as outside of a run, or are too short at a stage
+      of a step. A newborn has its row from its second step on.
     Raises: ValueError, if neighbours are none or a number is negative; in `simulate`, if the diameter is above the
       cutoff.
     Example:
@@ -173,8 +178,9 @@ class Flocking(_Nearby):
       separation: (), m/s^2. Differentiable.
       alignment: (), 1/s. Differentiable.
       cohesion: (), 1/s^2. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass, neighbours, has_neighbours)``, (particle, dim), N; NaN
-      where the state's rows were never made, as outside of a run. A newborn has its row from its second step on.
+    Returns: called as a force ``(t, position, velocity, mass, neighbours, neighbours_made_at, has_neighbours)``,
+      (particle, dim), N; NaN where the state's rows were never made, as outside of a run, or are too short at a stage
+      of a step. A newborn has its row from its second step on.
     Raises: ValueError, if neighbours are none or a number is negative.
     Example:
       >>> import jax.numpy as jnp, jeuler
@@ -233,8 +239,9 @@ class Fluid(_Nearby):
       density: that at rest, (), kg/m^dim. Differentiable.
       stiffness: (), m^2/s^2. Differentiable.
       viscosity: dynamic, (), Pa s in space. Differentiable.
-    Returns: called as a force ``(t, position, velocity, mass, neighbours, has_neighbours)``, (particle, dim), N; NaN
-      where the state's rows were never made, as outside of a run. A newborn has its row from its second step on.
+    Returns: called as a force ``(t, position, velocity, mass, neighbours, neighbours_made_at, has_neighbours)``,
+      (particle, dim), N; NaN where the state's rows were never made, as outside of a run, or are too short at a stage
+      of a step. A newborn has its row from its second step on.
     Raises: ValueError, if neighbours are none, or a number is negative.
     Example:
       >>> import jax.numpy as jnp, jeuler
