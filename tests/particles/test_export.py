@@ -1,8 +1,10 @@
 """Files of runs: what is read back is what was written."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 
 import jeuler
 from jeuler import ParticleState, Scene, Solution
@@ -38,8 +40,33 @@ def test_vtk_has_points_and_the_lines_between_the_living(tmp_path):
     assert "POINTS 2 double\n6 7 0\n10 11 0\nVERTICES 2 4\n1 0\n1 1\nLINES 1 3\n2 0 1\nPOINT_DATA 2\n" in text
 
 
+def test_nc_is_the_dataset_as_xarray_reads_it(tmp_path):
+    (path,) = jeuler.export(run(), tmp_path / "run.nc")
+    made = run().to_xarray()
+    with xarray.open_dataset(path, engine="scipy") as found:
+        assert found.identical(made)
+        assert found.alive.dtype == bool
+        assert found.position.dims == ("time", "particle", "dim")
+        assert found.heat.dims == ("time", "particle")
+        np.testing.assert_array_equal(found.position.sel(time=0.5), run().y.position[1])
+    assert made.attrs == {"first_nonfinite": -1, "unresolved_contacts": 0}
+
+
+def test_a_run_of_another_pytree_is_a_dataset_by_its_paths():
+    def fall(t, y, args):
+        return {"height": y["speed"], "speed": -9.81 + 0 * y["speed"]}
+
+    y0 = {"height": jnp.zeros((2, 3)), "speed": jnp.ones((2, 3))}
+    made = jeuler.solve(fall, y0, dt=0.1, num_steps=2).to_xarray()
+    assert made.height.dims == ("time", "height_1", "height_2")
+    assert jeuler.solve(lambda t, y, a: y, 1.0, dt=0.1, num_steps=2).to_xarray().y.dims == ("time",)
+    batch = jax.vmap(lambda y: jeuler.solve(lambda t, y, a: y, y, dt=0.1, num_steps=2))(jnp.ones(2))
+    with pytest.raises(ValueError, match="one member of a batch"):
+        batch.to_xarray()
+
+
 def test_what_cannot_be_written_is_said(tmp_path):
-    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, got 'run\.usd'"):
+    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, \.nc, got 'run\.usd'"):
         jeuler.export(run(), tmp_path / "run.usd")
     with pytest.raises(ValueError, match="edges"):
         jeuler.export(run(), tmp_path / "run.vtk", edges=[[0, 3]])

@@ -11,6 +11,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler.particles.state import ParticleState
+from jeuler.solving.dataset import to_dataset
 
 
 @says_what_to_write()
@@ -20,7 +21,7 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
     ".npz" holds the times and each field of the state, as NumPy reads them. ".xyz" is one file of all saved times in
     extended XYZ, for OVITO. ".vtk" is one file for each saved time, run_0000.vtk and so on, for ParaView: particles as
     points, edges as lines. In .xyz and .vtk the dead are left out, and what lies on a line or in a plane has 0 as the
-    other coordinates.
+    other coordinates. ".nc" is NetCDF 3 of `Solution.to_xarray`, for xarray and what else reads it.
 
     Args:
       solution: what `simulate` returned, its ``.y`` a `ParticleState` with leading axis saved.
@@ -44,7 +45,7 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
             "export needs a solution whose .y is a ParticleState with leading axis saved; run simulate with save=None, "
             "and take one member of a batch"
         )
-    writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk}
+    writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk, ".nc": _write_nc}
     if path.suffix not in writers:
         raise ValueError(f"export writes {', '.join(writers)}, got {path.name!r}; give the path one of these ends")
     pairs = np.asarray(edges, int).reshape(-1, 2) if len(edges) else np.zeros((0, 2), int)
@@ -57,6 +58,11 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
 def _write_npz(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
     fields: dict[str, Any] = {name: np.asarray(getattr(solution.y, name)) for name in solution.y.fields()}
     np.savez_compressed(path, t=np.asarray(solution.t), **fields)
+    return [path]
+
+
+def _write_nc(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
+    to_dataset(solution).to_netcdf(path, engine="scipy")
     return [path]
 
 

@@ -20,6 +20,7 @@ from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
 from jeuler.solving._tables import solution_table
 from jeuler.solving.chunks import Progress, can_be_in_chunks, check_progress, run_in_chunks
+from jeuler.solving.dataset import to_dataset
 from jeuler.solving.grid import Checkpoint, Grid
 from jeuler.solving.long_runs import check_resume, run_on_disk
 from jeuler.solving.loop import Loop, in_one_scan, watched
@@ -74,6 +75,24 @@ class Solution:
         raise AttributeError(f"a Solution has {', '.join(own)}, got {name!r}{hint}")
 
     _repr_html_ = solution_table
+
+    def to_xarray(self) -> Any:
+        """The run as an ``xarray.Dataset``, with the times as its coordinate.
+
+        Its variables are the fields of the state, with axes (time, particle, dim), or the arrays of another pytree by
+        their paths, "y" for a single one. ``first_nonfinite`` and ``unresolved_contacts`` are attributes. Needs xarray:
+        ``pip install jeuler[io]``.
+
+        Returns: the dataset.
+        Raises: ValueError, if the solution is a batch of runs.
+        Example:
+          >>> import jax.numpy as jnp, jeuler
+          >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.ones((3, 2)))
+          >>> run = jeuler.simulate(jeuler.Scene(), state, dt=0.5, num_steps=2).to_xarray()
+          >>> run.position.dims, run.position.sel(time=1.0, particle=0).values.tolist()
+          (('time', 'particle', 'dim'), [1.0, 1.0])
+        """
+        return to_dataset(self)
 
 
 @says_what_to_write(**INSTEAD)
