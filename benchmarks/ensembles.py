@@ -3,6 +3,7 @@
 python benchmarks/ensembles.py million [MEMBERS]
 python benchmarks/ensembles.py devices [MEMBERS]       on 1, 2, 4 and 8 devices of one machine
 python benchmarks/ensembles.py processes [MEMBERS]     two processes by jax.distributed on loopback, beside one
+python benchmarks/ensembles.py killed [MEMBERS]        the same, one killed at work; how and when the other ends
 """
 
 import json
@@ -11,6 +12,7 @@ import resource
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 
 import jax
@@ -67,14 +69,40 @@ def million(count=1_000_000):
     )
 
 
-def processes(count=100_000):
+def two_children(count, **how):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    children = [
-        subprocess.Popen([sys.executable, __file__, "child", str(n), address, str(count)], stdout=subprocess.PIPE)
-        for n in range(2)
-    ]
+    return [subprocess.Popen([sys.executable, __file__, "child", str(n), address, str(count)], **how) for n in range(2)]
+
+
+def killed(count=100_000_000):
+    """kill -9 of one of two processes at work: the other ends, and says why."""
+    for victim in (1, 0):
+        with tempfile.TemporaryFile("w+") as words:
+            children = two_children(count, stdout=subprocess.PIPE, stderr=words)
+            for child in children:
+                child.stdout.readline()  # it has begun
+            time.sleep(3)
+            children[victim].kill()
+            start = time.perf_counter()
+            try:
+                code = children[1 - victim].wait(timeout=60)
+                print(
+                    f"process {victim} killed: the other ended after {time.perf_counter() - start:.0f} s, code {code}"
+                )
+            except subprocess.TimeoutExpired:
+                print(f"process {victim} killed: the other was still there after 60 s")
+            finally:
+                for child in children:
+                    child.kill()
+                    child.wait()
+            words.seek(0)
+            print(*[line for line in words.read().splitlines() if "rror" in line or "heartbeat" in line][:3], sep="\n")
+
+
+def processes(count=100_000):
+    children = two_children(count, stdout=subprocess.PIPE)
     answers = [json.loads(child.communicate()[0].splitlines()[-1]) for child in children]
     print("two processes", answers[0])
     print("the same in both", answers[0] == answers[1])
@@ -102,8 +130,9 @@ def on_devices(count):
 
 def child(number, address, count):
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    jax.distributed.initialize(address, num_processes=2, process_id=int(number))
+    jax.distributed.initialize(address, num_processes=2, process_id=int(number), heartbeat_timeout_seconds=20)
     mesh = jax.make_mesh((jax.device_count(),), ("member",))
+    print("begun", flush=True)
     print(json.dumps(with_ensemble(drawn(int(count)), mesh=mesh, batch=BATCH)))
 
 
@@ -112,5 +141,11 @@ if __name__ == "__main__":
     if task == "child":
         child(*rest)
     else:
-        tasks = {"million": million, "processes": processes, "devices": devices, "on_devices": on_devices}
+        tasks = {
+            "million": million,
+            "processes": processes,
+            "killed": killed,
+            "devices": devices,
+            "on_devices": on_devices,
+        }
         tasks[task](*map(int, rest))
