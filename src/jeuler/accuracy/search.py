@@ -311,7 +311,7 @@ class Search:
         what stability asks for, half if that is many, or at ``start``. An error far below the target beside others that
         are not is an accident of where the jumps fall on that grid: it is taken only if no other number of steps up to
         three times as many will do. Where only an error far below the target was found, up to 400 numbers of steps are
-        run from half as many on.
+        run from half as many on: the first that is near the target is taken, or else the fewest that will do.
         """
         many = self.most > self.planned
         num_steps = start or max(1, math.floor(self.interval / self.bound / (2 if many else 4)))
