@@ -40,6 +40,18 @@ def test_vtk_has_points_and_the_lines_between_the_living(tmp_path):
     assert "POINTS 2 double\n6 7 0\n10 11 0\nVERTICES 2 4\n1 0\n1 1\nLINES 1 3\n2 0 1\nPOINT_DATA 2\n" in text
 
 
+def test_ply_has_points_colours_and_the_lines_between_the_living(tmp_path):
+    red = jnp.tile(jnp.array([1.0, 0.2, 0.0]), (2, 3, 1))
+    coloured = Solution(run().t, run().y.replace(color=red), jnp.int32(-1))
+    first, second = jeuler.export(coloured, tmp_path / "run.ply", edges=[[0, 1], [0, 2]])
+    assert (first.name, second.name) == ("run_0000.ply", "run_0001.ply")
+    head, body = second.read_text().split("end_header\n")
+    assert head.startswith("ply\nformat ascii 1.0\ncomment t = 0.5 s\nelement vertex 2\nproperty double x\n")
+    assert head.endswith("property uchar blue\nelement edge 1\nproperty int vertex1\nproperty int vertex2\n")
+    assert body == "6 7 0 -6 -7 0 255 51 0\n10 11 0 -10 -11 0 255 51 0\n0 1\n"
+    assert "element edge" not in jeuler.export(run(), tmp_path / "bare.ply")[0].read_text()
+
+
 def test_nc_is_the_dataset_as_xarray_reads_it(tmp_path):
     (path,) = jeuler.export(run(), tmp_path / "run.nc")
     made = run().to_xarray()
@@ -66,7 +78,7 @@ def test_a_run_of_another_pytree_is_a_dataset_by_its_paths():
 
 
 def test_what_cannot_be_written_is_said(tmp_path):
-    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, \.nc, got 'run\.usd'"):
+    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, \.ply, \.nc, got 'run\.usd'"):
         jeuler.export(run(), tmp_path / "run.usd")
     with pytest.raises(ValueError, match="edges"):
         jeuler.export(run(), tmp_path / "run.vtk", edges=[[0, 3]])

@@ -19,15 +19,16 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
     """Write a run of particles to files, by the end of the path.
 
     ".npz" holds the times and each field of the state, as NumPy reads them. ".xyz" is one file of all saved times in
-    extended XYZ, for OVITO. ".vtk" is one file for each saved time, run_0000.vtk and so on, for ParaView: particles as
-    points, edges as lines. In .xyz and .vtk the dead are left out, and what lies on a line or in a plane has 0 as the
-    other coordinates. ".nc" is NetCDF 3 of `Solution.to_xarray`, for xarray and what else reads it.
+    extended XYZ, for OVITO. ".vtk" is one file for each saved time, run_0000.vtk and so on, for ParaView: particles
+    as points, edges as lines. ".ply" is the same in the Stanford format, with colours where the state has them. In
+    .xyz, .vtk and .ply the dead are left out, and what lies on a line or in a plane has 0 as the other coordinates.
+    ".nc" is NetCDF 3, the dataset of ``solution.to_xarray()``.
 
     Args:
       solution: what `simulate` returned, its ``.y`` a `ParticleState` with leading axis saved.
       path: where to; its folder must be there.
-      edges: pairs of particles drawn as lines, integers (edge, 2), such as ``springs.edges``; for .vtk. One with a dead
-        end is left out.
+      edges: pairs of particles drawn as lines, integers (edge, 2), such as ``springs.edges``; for .vtk and .ply. One
+        with a dead end is left out.
     Returns: the paths that were written, in the order of time.
     Raises: ValueError, if the solution holds no states, or the path ends otherwise.
     Example:
@@ -45,7 +46,7 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
             "export needs a solution whose .y is a ParticleState with leading axis saved; run simulate with save=None, "
             "and take one member of a batch"
         )
-    writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk, ".nc": _write_nc}
+    writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk, ".ply": _write_ply, ".nc": _write_nc}
     if path.suffix not in writers:
         raise ValueError(f"export writes {', '.join(writers)}, got {path.name!r}; give the path one of these ends")
     pairs = np.asarray(edges, int).reshape(-1, 2) if len(edges) else np.zeros((0, 2), int)
@@ -83,21 +84,48 @@ def _write_xyz(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pat
     return [path]
 
 
+def _lines(here: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """The pairs between the living, by their numbers among these."""
+    return (np.cumsum(here) - 1)[pairs[here[pairs].all(axis=1)]]
+
+
 def _write_vtk(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
     """Legacy VTK, https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html."""
     written = []
     for n, t in enumerate(np.asarray(solution.t)):
         here, x, v = _living(solution.y, n)
-        number = np.cumsum(here) - 1
-        lines = number[pairs[here[pairs].all(axis=1)]]
         own = path.with_name(f"{path.stem}_{n:04d}{path.suffix}")
         with own.open("w", encoding="utf-8") as file:
             file.write(f"# vtk DataFile Version 3.0\nt = {t:.9g} s\nASCII\nDATASET POLYDATA\nPOINTS {len(x)} double\n")
             np.savetxt(file, x, fmt="%.9g")
             _write_cells(file, "VERTICES", np.arange(len(x))[:, None])
-            _write_cells(file, "LINES", lines)
+            _write_cells(file, "LINES", _lines(here, pairs))
             file.write(f"POINT_DATA {len(x)}\nVECTORS velocity double\n")
             np.savetxt(file, v, fmt="%.9g")
+        written.append(own)
+    return written
+
+
+def _write_ply(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
+    """The Stanford format as text: G. Turk, The PLY Polygon File Format, 1994."""
+    written = []
+    color = solution.y.color
+    for n, t in enumerate(np.asarray(solution.t)):
+        here, x, v = _living(solution.y, n)
+        table, names = [x, v], [f"double {name}" for name in ("x", "y", "z", "vx", "vy", "vz")]
+        if color is not None:
+            table.append(np.rint(255 * np.clip(np.asarray(color[n])[here], 0, 1)))
+            names += [f"uchar {name}" for name in ("red", "green", "blue")]
+        lines = _lines(here, pairs)
+        head = ["ply", "format ascii 1.0", f"comment t = {t:.9g} s", f"element vertex {len(x)}"]
+        head += [f"property {name}" for name in names]
+        if len(pairs):
+            head += [f"element edge {len(lines)}", "property int vertex1", "property int vertex2"]
+        own = path.with_name(f"{path.stem}_{n:04d}{path.suffix}")
+        with own.open("w", encoding="ascii") as file:
+            file.write("\n".join([*head, "end_header"]) + "\n")
+            np.savetxt(file, np.column_stack(table), fmt="%.9g")
+            np.savetxt(file, lines, fmt="%d")
         written.append(own)
     return written
 

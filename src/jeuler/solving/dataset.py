@@ -11,7 +11,7 @@ OF_A_PARTICLE = {"position": "dim", "velocity": "dim", "force": "dim", "color": 
 
 
 def to_dataset(solution: Any) -> Any:
-    """The ``xarray.Dataset`` of a run, see `jeuler.Solution.to_xarray`."""
+    """The ``xarray.Dataset`` of a run, see ``Solution.to_xarray``."""
     import xarray
 
     t = np.asarray(solution.t)
