@@ -4,8 +4,10 @@ from jeuler.plotting.accuracy import plot_work_precision
 from jeuler.plotting.camera import Camera
 from jeuler.plotting.film import animate
 from jeuler.plotting.fits import plot_fit
+from jeuler.plotting.hair import Hair
 from jeuler.plotting.render import Look, draw
 from jeuler.plotting.residuals import plot_correlation, plot_history, plot_net, plot_residual
+from jeuler.plotting.still import still
 from jeuler.plotting.teaching import (
     error_against_dt,
     euler_polygon,
@@ -20,6 +22,7 @@ from jeuler.plotting.turnable import view
 
 __all__ = [
     "Camera",
+    "Hair",
     "Look",
     "animate",
     "draw",
@@ -36,6 +39,7 @@ __all__ = [
     "slope_field",
     "stability_regions",
     "step_sizes",
+    "still",
     "tangent_step",
     "view",
 ]

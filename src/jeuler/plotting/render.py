@@ -32,8 +32,17 @@ class Look:
       width: of these lines, points.
       faces: the particles at the corners of a surface's triangles, integers (face, 3): cloth, the skin of a body,
         shaded in the colour of its particles.
-      particles: False draws no particles, only what they hold.
-    Raises: ValueError, if links is none of the three or faces are not (face, 3).
+      particles: True draws them as dots, in `still` as balls; "puffs" are soft and lit through each other, "streaks"
+        show the way of the last 0.03 s, "runners" and "birds" are bodies one size high or wide that look along their
+        velocity (four looks that only `still` has, elsewhere they are dots); False draws no particles, only what
+        they hold.
+      sky: colour of the upper end of the background in `still`; None takes the background's.
+      solids: colour of solids in `still`.
+      hair: a `Hair`, strands about guides, in `still`.
+      dust: colour of the dust that runners raise in `still`; None raises none.
+      haze: how fast what is far fades into the background in `still`, 0 for clear air.
+      thickness: how much light puffs take from those behind them, 0 for none.
+    Raises: ValueError, if links or particles is none of these, or faces are not (face, 3).
     Example:
       >>> from jeuler.plotting import Look
       >>> Look(background="black", links="color").width  # hair on black
@@ -44,9 +53,19 @@ class Look:
     links: str | None = "strain"
     width: float = 0.9
     faces: Any = None
-    particles: bool = True
+    particles: bool | str = True
+    sky: Any = None
+    solids: Any = "#d9d4c7"
+    hair: Any = None
+    dust: Any = None
+    haze: float = 0.25
+    thickness: float = 1.0
 
     def __post_init__(self) -> None:
+        if self.particles not in (True, False, "puffs", "streaks", "runners", "birds"):
+            raise ValueError(
+                f'Look.particles must be True, False, "puffs", "streaks", "runners" or "birds", got {self.particles!r}'
+            )
         if self.links not in ("strain", "color", None):
             raise ValueError(f'Look.links must be "strain", "color" or None, got {self.links!r}')
         shape = np.shape(self.faces)

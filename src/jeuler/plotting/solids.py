@@ -55,7 +55,7 @@ def in_sight(colliders: list[Any], t: float, position: np.ndarray, toward: np.nd
 
 def _in_plane(ax: Any, collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> list[Any]:
     """The solid part, filled, with its outline."""
-    x, y = (np.linspace(center[k] - 1.5 * half[k], center[k] + 1.5 * half[k], 200) for k in range(2))
+    x, y = (np.linspace(center[k] - 1.05 * half[k], center[k] + 1.05 * half[k], 700) for k in range(2))
     points = np.stack(np.meshgrid(x, y), axis=-1)
     d = distances(collider, t, points)
     if not (d.min() < 0 < d.max()):

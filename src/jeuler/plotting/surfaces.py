@@ -34,7 +34,8 @@ def mesh_of(
     if isinstance(collider, Sphere):
         return ball(middle(collider, t), float(collider.radius), cells)
     if isinstance(collider, Box):
-        return block(middle(collider, t), np.broadcast_to(np.asarray(collider.half_size), 3))
+        half = np.broadcast_to(np.asarray(collider.half_size), 3)
+        return block(middle(collider, t), half, cells // 2 if cells > 60 else 1)
     x, y, z = upper_side(collider, t, center, half, cells)
     there = np.isfinite(z)
     triangles = grid_triangles(z.shape)
@@ -43,24 +44,50 @@ def mesh_of(
     return np.stack([x, y, z], axis=-1)[there], number[triangles]
 
 
+def fine_mesh_of(collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """As `mesh_of`, finer near the middle of the view and farther out; and whether it is the ground."""
+    if isinstance(collider, (Sphere, Box)):
+        return *mesh_of(collider, t, center, half, cells=120), False
+    wide = half[:2].max()
+    u = np.linspace(-1, 1, 401)
+    x, y = np.meshgrid(*(center[k] + 12 * wide * (0.06 * u + 0.94 * u**3) for k in range(2)), indexing="ij")
+    if isinstance(collider, Plane):
+        point, normal = np.asarray(collider.point), np.asarray(collider.normal)
+        if abs(normal[2]) < 1e-6 * np.linalg.norm(normal):
+            return np.zeros((0, 3)), np.zeros((0, 3), int), True
+        z = point[2] - ((x - point[0]) * normal[0] + (y - point[1]) * normal[1]) / normal[2]
+    else:
+        z = highest_zero(collider, t, x, y, center[2] - 2 * wide, center[2] + 2 * wide)
+    there = np.isfinite(z)
+    triangles = grid_triangles(z.shape)
+    triangles = triangles[there.ravel()[triangles].all(axis=1)]
+    return np.stack([x, y, np.nan_to_num(z)], axis=-1).reshape(-1, 3), triangles, True
+
+
+def highest_zero(collider: Any, t: float, x: np.ndarray, y: np.ndarray, low: float, high: float) -> np.ndarray:
+    """The height at which a ray from above meets a solid, by steps of its distance; NaN where it meets none."""
+    z = np.full(x.shape, high)
+    for _ in range(40):
+        z = z - np.maximum(distances(collider, t, np.stack([x, y, z], axis=-1)), 0)
+    return np.where((z > low) & (z < high), z, np.nan)
+
+
 def ball(center: np.ndarray, radius: float, cells: int) -> tuple[np.ndarray, np.ndarray]:
     a, b = np.meshgrid(np.linspace(0, 2 * np.pi, 2 * cells + 1), np.linspace(0, np.pi, cells + 1), indexing="ij")
     points = center + radius * np.stack([np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.cos(b)], axis=-1)
     return points.reshape(-1, 3), grid_triangles(a.shape)[:, ::-1]
 
 
-def block(center: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def block(center: np.ndarray, half: np.ndarray, cells: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Six sides with corners of their own, so that edges stay sharp where normals are smoothed."""
     points: list[np.ndarray] = []
     triangles: list[np.ndarray] = []
+    u, v = np.meshgrid(*[np.linspace(-1, 1, cells + 1)] * 2, indexing="ij")
     for axis in range(3):
         for side in (-1.0, 1.0):
-            corners = np.empty((4, 3))
-            corners[:, axis] = side
-            corners[:, (axis + 1) % 3] = np.array([-1, 1, 1, -1]) * side
-            corners[:, (axis + 2) % 3] = [-1, -1, 1, 1]
-            triangles.append(np.array([[0, 1, 2], [0, 2, 3]]) + 4 * len(points))
-            points.append(center + half * corners)
+            corners = np.roll(np.stack([np.full_like(u, side), side * u, v], axis=-1), axis, axis=-1)
+            triangles.append(grid_triangles(u.shape) + u.size * len(points))
+            points.append(center + half * corners.reshape(-1, 3))
     return np.concatenate(points), np.concatenate(triangles)
 
 

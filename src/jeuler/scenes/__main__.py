@@ -18,7 +18,7 @@ def main() -> None:
     names = sys.argv[2:] or [scene.__name__ for scene in scenes.ALL]
     for name in names:
         path = folder / f"{name}.png"
-        getattr(scenes, name)().picture(path)
+        getattr(scenes, name)().picture(path, size=(1024, 640))
         Image.open(path).convert("RGB").quantize(256).save(path, optimize=True)
         print(path)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 from typing import Any
 
 import jax
@@ -54,14 +55,27 @@ class Setup:
 
         return animate(self.run(), self.scene, path, **(self._shown() | options))
 
-    def picture(self, path: Any, frame: int | None = None, solution: Solution | None = None, **options: Any) -> None:
-        """A picture of one saved state of the run, written to the path."""
+    def picture(
+        self, path: Any, frame: int | None = None, solution: Solution | None = None,
+        size: tuple[int, int] = (1600, 1000),
+    ) -> None:  # fmt: skip
+        """A picture of one saved state, size in pixels: in space by `plotting.still` where PyVista is installed."""
         from jeuler.plotting.render import save_picture
+        from jeuler.plotting.still import still
 
         solution = self.run() if solution is None else solution
         frame = self.frame if frame is None else frame
-        state = jax.tree.map(lambda x: x[frame], solution.y)
-        save_picture(path, state, self.scene, t=float(solution.t[frame]), **(self._shown() | options))
+        state, t = jax.tree.map(lambda x: x[frame], solution.y), float(solution.t[frame])
+        if state.position.shape[-1] == 3 and importlib.util.find_spec("pyvista"):
+            still(state, self.scene, path, t=t, size=size, **self._shown())
+        else:
+            save_picture(path, state, self.scene, t=t, size=(size[0] / 100, size[1] / 100), dpi=100, **self._shown())
+
+    def view(self, path: Any = None, **options: Any) -> Any:
+        """The run as a `plotting.view` that is turned with the mouse, written to the path (.html) if there is one."""
+        from jeuler.plotting.turnable import view
+
+        return view(self.run(), self.scene, path, **(self._shown() | options))
 
     def _shown(self) -> dict[str, Any]:
         from jeuler.plotting.camera import Camera
