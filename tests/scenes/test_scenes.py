@@ -120,7 +120,7 @@ def test_the_rain_heaps_up_to_a_bell_in_bins_and_never_enters_a_peg():
 
 
 def test_the_flock_keeps_its_distance_goes_one_way_and_stays_together():
-    _, y = run("flock", birds=120)
+    _, y = run("flock", birds=300)
     assert int(y.missed_neighbours[-1]) == 0
     speed = np.linalg.norm(y.velocity[-1], axis=1)
     assert speed.max() <= 18.0 + 1e-4
