@@ -12,7 +12,7 @@ from jeuler.plotting import Camera, Hair, Look, still
 from jeuler.plotting.hair import splines
 from jeuler.plotting.light import light_through
 from jeuler.plotting.models import Shadows, bake, copies, exposed, model, sky_directions
-from jeuler.plotting.still import bird, round_body, runner
+from jeuler.plotting.studio import bird, round_body, runner
 from jeuler.plotting.surfaces import fine_mesh_of
 
 UP = np.array([0.0, 0.0, 1.0])

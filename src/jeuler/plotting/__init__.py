@@ -7,7 +7,7 @@ from jeuler.plotting.fits import plot_fit
 from jeuler.plotting.hair import Hair
 from jeuler.plotting.render import Look, draw
 from jeuler.plotting.residuals import plot_correlation, plot_history, plot_net, plot_residual
-from jeuler.plotting.still import still
+from jeuler.plotting.studio import still
 from jeuler.plotting.teaching import (
     error_against_dt,
     euler_polygon,

@@ -61,7 +61,7 @@ class Setup:
     ) -> None:  # fmt: skip
         """A picture of one saved state, size in pixels: in space by `plotting.still` where PyVista is installed."""
         from jeuler.plotting.render import save_picture
-        from jeuler.plotting.still import still
+        from jeuler.plotting.studio import still
 
         solution = self.run() if solution is None else solution
         frame = self.frame if frame is None else frame
