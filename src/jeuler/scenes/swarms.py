@@ -47,7 +47,7 @@ def foam(t: Any, dt: Any, state: ParticleState, key: Any) -> ParticleState:
 
 
 def dam_break(across: int = 8, spacing: float = 0.05) -> Setup:
-    """A dam breaks: a block of water, held by nothing, falls, runs along a trough and climbs its far end."""
+    """A dam breaks: a block of water, held by nothing, falls and runs along a trough."""
     n = np.array([2 * across, across, 2 * across])
     place = np.stack(np.meshgrid(*[np.arange(k) for k in n], indexing="ij"), axis=-1).reshape(-1, 3)
     position = spacing * (place + 0.5 + np.random.default_rng(0).uniform(-0.05, 0.05, place.shape))
