@@ -18,9 +18,9 @@ from jeuler.scenes.shapes import Body, rows
 
 
 def sheet(long: int, wide: int) -> Body:
-    """A level sheet of long x wide particles, 1 mm apart, joined along its threads and across its meshes."""
+    """A level sheet of long x wide particles, 1 m wide, joined along its threads and across its meshes."""
     g = np.arange(long * wide).reshape(long, wide)
-    x, y = np.meshgrid(1e-3 * np.arange(long), 1e-3 * np.arange(wide), indexing="ij")
+    x, y = np.meshgrid(*[np.arange(n) / (wide - 1) - n / wide / 2 for n in (long, wide)], indexing="ij")
     edges = [rows(g[:-1], g[1:]), rows(g[:, :-1], g[:, 1:]), rows(g[:-1, :-1], g[1:, 1:]), rows(g[:-1, 1:], g[1:, :-1])]
     lines = [rows(g[:-2], g[1:-1], g[2:]), rows(g[:, :-2], g[:, 1:-1], g[:, 2:])]
     place = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
@@ -30,18 +30,18 @@ def sheet(long: int, wide: int) -> Body:
 def problem(long: int, wide: int, num_steps: int, mesh=None):
     """The scene and state, and the function of (ks, position) that runs it."""
     body, noise = sheet(long, wide), np.random.default_rng(0)
-    x = jnp.asarray(body.position + 1e-5 * noise.normal(size=body.position.shape), jnp.float32)
-    mass = jnp.full(len(x), 1e-3, jnp.float32).at[0].set(jnp.inf)
+    x = jnp.asarray(body.position + 0.01 / wide * noise.normal(size=body.position.shape), jnp.float32)
+    mass = jnp.full(len(x), 0.1, jnp.float32).at[0].set(jnp.inf)
     state = jeuler.ParticleState(x, jnp.zeros_like(x), mass=mass)
     ks = jnp.full(len(body.edges), 20.0, jnp.float32)
 
     def scene(ks):
-        ball = jeuler.PenaltyContact(jeuler.Sphere([0.2, 0.2, -0.1], 0.0999), ks=10.0)
-        links = jeuler.Springs(body.edges, ks, 1e-3, body.length), jeuler.Bending(body.lines, 1e-9)
-        return jeuler.Scene((*links, jeuler.Gravity([0.0, 0.0, -9.8]), jeuler.LinearDrag(1e-4), ball))
+        ball = jeuler.PenaltyContact(jeuler.Sphere([0.0, 0.0, -0.4], 0.395), ks=10.0)
+        links = jeuler.Springs(body.edges, ks, 0.1, body.length), jeuler.Bending(body.lines, 1e-4)
+        return jeuler.Scene((*links, jeuler.Gravity([0.0, 0.0, -9.8]), jeuler.LinearDrag(0.01), ball))
 
     def end(ks, x):
-        how = {"dt": 1e-4, "num_steps": num_steps, "save_every": num_steps, "step": jeuler.symplectic_euler_step}
+        how = {"dt": 1e-3, "num_steps": num_steps, "save_every": num_steps, "step": jeuler.symplectic_euler_step}
         y = jeuler.simulate(scene(ks), state.replace(position=x), **how, mesh=mesh).y.position[-1]
         return jnp.sum(y**2), y
 
