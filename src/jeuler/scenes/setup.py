@@ -59,7 +59,7 @@ class Setup:
         self, path: Any, frame: int | None = None, solution: Solution | None = None,
         size: tuple[int, int] = (1600, 1000),
     ) -> None:  # fmt: skip
-        """A picture of one saved state, size in pixels: in space by `plotting.still` where PyVista is installed."""
+        """A picture of one saved state, size in pixels: in space by ``plotting.still`` where PyVista is installed."""
         from jeuler.plotting.render import save_picture
         from jeuler.plotting.studio import still
 
@@ -72,7 +72,7 @@ class Setup:
             save_picture(path, state, self.scene, t=t, size=(size[0] / 100, size[1] / 100), dpi=100, **self._shown())
 
     def view(self, path: Any = None, **options: Any) -> Any:
-        """The run as a `plotting.view` that is turned with the mouse, written to the path (.html) if there is one."""
+        """The run as a ``plotting.view`` that is turned with the mouse, written to the path (.html) if there is one."""
         from jeuler.plotting.turnable import view
 
         return view(self.run(), self.scene, path, **(self._shown() | options))
