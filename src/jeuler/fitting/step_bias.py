@@ -26,7 +26,7 @@ RANDOM = "the run draws random numbers in each step, so the bias of the step is 
 def bias_of_step(task: Recorded, found: Fit, state: State) -> tuple[Any, list[str]]:
     """The shift of each parameter by the integrator's error, and what is to be said about it.
 
-        shift = J^+ (r(dt) - r(0)),   r(0) = r(dt) + (r(dt / 2) - r(dt)) 2^q / (2^q - 1)
+        shift = J^+ (r(0) - r(dt)),   r(0) = r(dt) + (r(dt / 2) - r(dt)) 2^q / (2^q - 1)
 
     Args:
       task: the recording with the scene.
@@ -87,9 +87,9 @@ def _residuals(task: Recorded, layout: Layout, found: Fit) -> tuple[np.ndarray, 
 
 
 def _shift(state: State, change: np.ndarray, inverse: np.ndarray | None) -> np.ndarray:
-    """-J^+ of a change of the weighted residual."""
+    """J^+ of a change of the weighted residual: how far the minimum is from where it is with that change."""
     if inverse is not None:
-        return np.asarray(-inverse @ (state.jacobian.T @ change))
+        return np.asarray(inverse @ (state.jacobian.T @ change))
     scale = np.where(state.scale > 0, state.scale, 1)
     q, triangle = projected(state.jacobian / scale, change[:, None])
     return -least_squares.damped_solution(triangle, q[:, 0], np.asarray(0.0)) / scale
