@@ -141,6 +141,24 @@ def test_the_fit_of_the_whole_motion_refines(net):
     assert (found.stderr["ks"] < 0.5).all()
 
 
+@pytest.mark.parametrize("noise", [1e-3, 1e-2], ids=["0.1 %", "1 %"])
+@pytest.mark.parametrize(("samples", "followed"), [(6.3, True), (4.8, True), (3.1, False)])
+def test_few_samples_a_period_give_honest_errors_or_a_word(samples, followed, noise):
+    """Of the swing of the stiffest pair. The covariance of the accelerations alone is 6 standard errors off at 4.8."""
+    position, edges = CORNERS[:3], np.array([[0, 1], [1, 2]])
+    ks, lengths = np.array([300.0, 200.0]), np.linalg.norm(np.diff(CORNERS[:3], axis=0), axis=1)
+    times = 2 * np.pi / np.sqrt(600.0) / samples * np.arange(81)
+    velocity = np.random.default_rng(1).normal(size=(3, 2))
+    seen = tracks(position, velocity, edges, ks, KD, lengths, np.ones(3), times)
+    seen = seen + 0.08 * noise * np.random.default_rng(2).normal(size=seen.shape)
+    found = jeuler.find_springs(times, seen, mass=1.0, refine=False)
+    assert found.explained == followed
+    assert ("is not followed" in found.message) != followed
+    if followed:
+        assert found.edges.tolist() == edges.tolist()
+        assert (np.abs(found.ks - ks) < 3 * found.stderr["ks"]).all()
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [

@@ -13,9 +13,10 @@ from jeuler._core.component import result
 from jeuler.fitting._springs import SpringFit
 from jeuler.fitting._tables import springs_text
 from jeuler.fitting.finding.refined import refined, springs_of
+from jeuler.fitting.finding.smoothing import at_samples, force_errors, motion_left
 from jeuler.fitting.finding.tracked import Tracked
 from jeuler.fitting.finding.whole_motion import by_whole_motion, in_doubt
-from jeuler.fitting.finding.words import hiding, not_explained, sentences
+from jeuler.fitting.finding.words import hiding, not_explained, sentences, too_coarse
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
@@ -28,13 +29,14 @@ class FoundSprings:
       edges: which particles are joined, (spring, 2).
       ks, kd, rest_length: of each spring, (spring,), N/m, N s/m and m.
       stderr: their standard errors by name, (spring,) each; inf where a rest length was taken to be 0 or a damping not
-        seen.
+        seen. They hold the noise of the accelerations and what smoothing does to the forces.
       significance: how far above the noise each spring is, in standard errors, (spring,).
       candidates: the pairs that were looked at, (pair, 2).
       least_seen: the stiffness that a spring would need at each of them to be found in 95 of 100 records, (pair,), N/m.
       hidden: candidates that could hold a spring unseen, as the motion does not excite it, (pair, 2).
       explained: whether springs between the tracked particles, with the given forces, explain the motion down to the
-        noise. If not, a particle or a force is missing, and the springs are not to be trusted.
+        noise. If not, a particle or a force is missing, or the samples lie too far apart, and the springs are not to be
+        trusted.
       sigma: the noise of the positions, m.
       scene, state: the scene with the springs and forces, and the state at the first time.
       fit: the `SpringFit` that refined the values; None where there was none.
@@ -138,6 +140,12 @@ def find_springs(
     if refine and len(found.chosen):
         values, fit, more = refined(task, found, values, explained)
         words += more
+    if fit is None and len(found.chosen):
+        values = values.with_errors(force_errors(task, found))
+    omega = motion_left(task, at_samples(task) if fit is None else np.asarray(fit.predicted))
+    if omega is not None:
+        explained = False
+        words.insert(0, too_coarse(task, omega))
     return FoundSprings(
         edges=values.edges,
         ks=values.ks,

@@ -32,6 +32,11 @@ class Values:
     rest_length: np.ndarray
     stderr: dict[str, np.ndarray]
 
+    def with_errors(self, more: np.ndarray) -> Values:
+        """With further errors of ks, rest length and kd, (3, spring)."""
+        stderr = {name: np.hypot(self.stderr[name], one) for name, one in zip(NAMES, more, strict=True)}
+        return dataclasses.replace(self, stderr=stderr)
+
     def scene(self, task: Tracked) -> Scene:
         """They and the known forces."""
         numbers = (jnp.asarray(x) for x in (self.ks, self.kd, self.rest_length))

@@ -75,6 +75,14 @@ def selected(normal: Normal, terms: tuple[bool, bool, bool], chosen: list[int], 
     return fit.selection(terms, limit)
 
 
+def solved(normal: Normal, terms: tuple[bool, bool, bool]) -> np.ndarray:
+    """The terms of all pairs, (pair, 3); 0 where a term is not used."""
+    use, count = np.flatnonzero(terms), normal.gram.shape[0] // len(TERMS)
+    values = np.zeros((count, len(TERMS)))
+    values[:, use] = _Fit(normal, use, list(range(count))).x.reshape(count, len(use))
+    return values
+
+
 def _information(one: Selection, found: list[Selection], rows: int) -> float:
     """Bayes' information criterion, in units of the noise that the best of them leaves."""
     surplus = min(other.surplus for other in found)

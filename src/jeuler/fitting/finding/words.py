@@ -27,6 +27,15 @@ def hiding(task: Tracked, found: Selection) -> np.ndarray:
     return task.pairs[rest[found.least_seen[rest] > STRONG * usual]]
 
 
+def too_coarse(task: Tracked, omega: float) -> str:
+    """Where a motion is in the tracks that the springs were not given to explain."""
+    samples = 2 * np.pi / (omega * task.motion.tracks.spacing)
+    return (
+        f"a motion of {omega:.3g} rad/s is not followed, {samples:.2g} samples a period: what was taken for noise is "
+        f"motion, and springs, errors and what was not found are not to be trusted; take more samples a second"
+    )
+
+
 def sentences(task: Tracked, normal: Normal, found: Selection, alpha: float, hidden: np.ndarray) -> Iterator[str]:
     """One after the other, the most important first."""
     if not_explained(normal, found):
