@@ -92,6 +92,26 @@ def test_recordings_with_measured_inputs_of_their_own_give_spring_and_gain(rando
     assert found.explained > 0.99999
 
 
+def test_a_moving_support_that_was_measured_gives_the_spring_that_hangs_on_it(random):
+    """The support moves as 0.05 cos(4 t), measured 25 times a second: x'' = -ks (x - s) - kd (x' - s'), from rest."""
+    rate, t = 4.0, np.arange(0.0, 4.0 + 1e-9, 0.04)
+    amplitude = 0.05 * (KS + 1j * rate * KD) / (KS - rate**2 + 1j * rate * KD)  # of the steady motion
+    g = KD / 2
+    w = np.sqrt(KS - g * g)
+    x0, v0 = -amplitude.real, -(1j * rate * amplitude).real
+    x = np.exp(-g * t) * (x0 * np.cos(w * t) + (v0 + g * x0) / w * np.sin(w * t))
+    x = x + (amplitude * np.exp(1j * rate * t)).real
+    support = 0.05 * np.cos(rate * t)
+    hand = jeuler.PrescribedMotion([0], jeuler.SampledPath.band_limited(t, support[:, None, None]))
+    scene = jeuler.Scene(SCENE.forces, (hand,))
+    state = jeuler.ParticleState([[0.05], [1.0]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
+    reading = 1 + x + 1e-4 * random.normal(size=t.shape)
+    options = {"observe": observing.Position([1]), "dt": 0.02, "parameters": ("ks", "kd"), "sigma": 1e-4}
+    found = jeuler.fit_springs(scene, state, t, reading, **options)
+    np.testing.assert_allclose([found.ks, found.kd], [KS, KD], rtol=5e-3)
+    assert found.noise_ratio < 1.2
+
+
 def test_angles_are_compared_up_to_full_turns():
     """A pendulum that goes over the top twice, its angle unwrapped, on a stiff spring."""
     state = jeuler.ParticleState([[0.0, 0.0], [0.0, -1.02]], [[0.0, 0.0], [7.0, 0.0]], mass=[jnp.inf, 1.0])

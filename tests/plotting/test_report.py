@@ -3,9 +3,12 @@
 import html.parser
 import os
 import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import jeuler
 from jeuler.plotting import plot_correlation, plot_history, plot_net, plot_residual
@@ -95,6 +98,26 @@ def test_a_page_that_fails_leaves_what_stood_there(tmp_path):
     assert os.listdir(tmp_path) == ["fit.html"]
     FitReport(**PARTS).write(path)
     assert path.read_text().startswith("<!doctype html>")
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs the program chromium")
+@pytest.mark.parametrize("width", [1200, 400])
+def test_chromium_shows_the_report_within_the_window(tmp_path, width):
+    net = Net([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [[0, 1], [1, 2]], {"ks [N/m]": [1.0, 2.0]})
+    FitReport(**PARTS, net=net).write(tmp_path / "fit.html")
+    subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+         f"--window-size={width},2400", f"--user-data-dir={tmp_path / 'profile'}",
+         f"--screenshot={tmp_path / 'fit.png'}", (tmp_path / "fit.html").as_uri()],
+        check=True, capture_output=True, timeout=60,
+    )  # fmt: skip
+    rgb = np.asarray(Image.open(tmp_path / "fit.png").convert("RGB")).astype(int)
+    assert rgb.shape[1] == width
+    ink = rgb.min(axis=2) < 200
+    assert not ink[:, -8:].any(), "nothing is cut off at the right edge"
+    blue = (rgb[..., 2] > 150) & (rgb[..., 0] < 60)
+    assert blue.sum() > 200, "curves"
+    assert (ink[:400].sum() > 2000) & (ink[400:].sum() > 2000), "words and figures"
 
 
 def test_the_report_of_a_fit_of_springs(tmp_path):
