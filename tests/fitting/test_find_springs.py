@@ -141,6 +141,17 @@ def test_the_fit_of_the_whole_motion_refines(net):
     assert (found.stderr["ks"] < 0.5).all()
 
 
+@pytest.mark.parametrize(("noise", "said"), [(1e-3, False), (0.02, True)])
+def test_noise_beside_which_a_spring_hardly_changes_its_length_is_said(noise, said):
+    t = np.linspace(0, 6, 201)
+    swing = 0.5 + 0.05 * np.cos(np.sqrt(2 * 10.0) * t)
+    seen = np.stack([-swing, swing], axis=1)[:, :, None]
+    seen = seen + noise * np.random.default_rng(0).normal(size=seen.shape)
+    found = jeuler.find_springs(t, seen, mass=1.0, refine=False)
+    assert found.edges.tolist() == [[0, 1]]
+    assert ("may be too low" in found.message) == said
+
+
 @pytest.mark.parametrize("noise", [1e-3, 1e-2], ids=["0.1 %", "1 %"])
 @pytest.mark.parametrize(("samples", "followed"), [(6.3, True), (4.8, True), (3.1, False)])
 def test_few_samples_a_period_give_honest_errors_or_a_word(samples, followed, noise):

@@ -16,7 +16,7 @@ from jeuler.fitting.finding.refined import refined, springs_of
 from jeuler.fitting.finding.smoothing import at_samples, force_errors, motion_left
 from jeuler.fitting.finding.tracked import Tracked
 from jeuler.fitting.finding.whole_motion import by_whole_motion, in_doubt
-from jeuler.fitting.finding.words import hiding, not_explained, sentences, too_coarse
+from jeuler.fitting.finding.words import buried, hiding, not_explained, sentences, too_coarse
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 
@@ -142,6 +142,7 @@ def find_springs(
         words += more
     if fit is None and len(found.chosen):
         values = values.with_errors(force_errors(task, found))
+        words += buried(task, found)
     omega = motion_left(task, at_samples(task) if fit is None else np.asarray(fit.predicted))
     if omega is not None:
         explained = False

@@ -12,6 +12,7 @@ from jeuler.fitting.finding.tracked import Tracked
 
 MUCH = 1.5  # times the noise: more than that is left by a force that is missing
 FLOOR = 1e-4  # share of the sum of squares below which what is left is the error of the quadrature
+BURIED = 0.1  # of the change of a spring's length: more noise than that makes its ks too low
 STRONG = 0.5  # of the median stiffness that was found: a pair that could hide that much was not excited
 
 
@@ -25,6 +26,18 @@ def hiding(task: Tracked, found: Selection) -> np.ndarray:
     rest = np.setdiff1d(np.arange(len(task.pairs)), found.chosen)
     usual = float(np.median(found.values[:, 0])) if len(found.chosen) else 0.0
     return task.pairs[rest[found.least_seen[rest] > STRONG * usual]]
+
+
+def buried(task: Tracked, found: Selection) -> Iterator[str]:
+    """Springs whose lengths change by little beside the noise: the weak form makes these too soft."""
+    x, pairs = task.motion.tracks.position, task.pairs[found.chosen]
+    change = np.array([np.std(np.linalg.norm(x[:, a] - x[:, b], axis=-1)) for a, b in pairs.tolist()])
+    low = pairs[task.motion.sigma > BURIED * change]
+    if len(low):
+        yield (
+            f"the noise is more than {BURIED:g} of what the lengths of springs {_list(map(tuple, low.tolist()))} "
+            f"change by: their ks may be too low by more than the errors say"
+        )
 
 
 def too_coarse(task: Tracked, omega: float) -> str:
