@@ -71,7 +71,7 @@ def charge(agents: int = 5000) -> Setup:
     place = np.stack([np.arange(agents) // rows, np.arange(agents) % rows], axis=1) - [rows, rows / 2]
     place = place * 0.9 + random.uniform(-0.15, 0.15, (agents, 2)) - [8.0, 0.0]
     position = np.concatenate([place, np.asarray(height(*place.T))[:, None] + 0.5 * TALL], axis=1)
-    near = Neighbours(cutoff=1.2, skin=0.8, capacity=24)
+    near = Neighbours(cutoff=1.2, skin=0.8, capacity=48, cell_capacity=48)
     rocks = tuple(PointAttractor([x, y, float(height(x, y))], -60.0 * r, softening=r) for x, y, r in ROCKS)
     limit = SpeedLimit(random.normal(7.0, 0.8, agents).clip(4.0, 9.0))
     apart = SoftRepulsion(near, diameter=1.1, ks=60.0, kd=4.0)
