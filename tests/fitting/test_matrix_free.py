@@ -101,6 +101,28 @@ def test_springs_are_those_of_the_exact_motion(without_a_jacobian):
     np.testing.assert_allclose(found.kd, 0.4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("dt", [0.1, 0.01])
+def test_the_bias_of_the_step_is_that_of_the_fit_that_forms_a_jacobian(dt, without_a_jacobian):
+    times, w, g = np.linspace(0, 5, 101), np.sqrt(100 - 0.04), 0.2
+    y = np.full((101, 2, 1), np.nan)
+    y[:, 1, 0] = 1 + 0.3 * np.exp(-g * times) * (np.cos(w * times) + g / w * np.sin(w * times))
+    y[:, 1, 0] += 1e-3 * np.random.default_rng(0).normal(size=101)
+    state = jeuler.ParticleState([[0.0], [1.3]], jnp.zeros((2, 1)), mass=[jnp.inf, 1.0])
+    arguments = jeuler.Scene((jeuler.Springs([[0, 1]], 80.0, 0.2, 1.0),)), state, times, y
+    formed = jeuler.fit_springs(*arguments, dt=dt)
+    without_a_jacobian(most_errors=10)
+    many = jeuler.fit_springs(*arguments, dt=dt)
+    without_a_jacobian()
+    found = jeuler.fit_springs(*arguments, dt=dt)
+    assert found.covariance is None
+    assert many.covariance is not None
+    assert ("moves the unknowns by" in found.message) == ("the integrator's error" in formed.message) == (dt == 0.1)
+    for name in ("ks", "kd"):
+        error = float(formed.stderr[name])
+        for other in (many, found):
+            np.testing.assert_allclose(other.step_bias[name], formed.step_bias[name], rtol=0.1, atol=0.03 * error)
+
+
 def test_conjugate_gradients_solve_and_say_what_is_left(random):
     root = random.normal(size=(40, 12))
     matrix, b = root.T @ root, random.normal(size=12)

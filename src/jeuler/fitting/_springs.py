@@ -49,7 +49,9 @@ class SpringFit(Fit):
       predicted: positions at the given times, (time, particle, dim), m; with ``observe`` what that shows, (time, ...);
         of several recordings a tuple of them.
       step_bias: how far the integrator's own error moves each parameter, of the structure of params: fitted minus what
-        an exact integrator would give. None where it was not asked for.
+        an exact integrator would give. None where it was not asked for or cannot be had, which the message says. Above
+        3,000 unknowns it is said where the root mean square of all shifts, in standard errors, is above a tenth;
+        of one number compare it with ``standard_error(name)``.
       start: where the search began: "data" (from the positions alone) or "given" (the scene's values).
       training_rms, held_out_rms: root mean square of prediction minus measurement over the part that was fitted and
         over that which was held out; None where nothing was.

@@ -68,7 +68,7 @@ class Products(NamedTuple):
 
 
 @functools.lru_cache(maxsize=8)
-def _products(residual: FlatResidual, loss: str) -> Products:
+def products(residual: FlatResidual, loss: str) -> Products:
     """Cost and damped step of a residual; kept, so that a fit of the same shape uses them again."""
     rho, residual = LOSSES[loss], quick_to_compile(residual)
 
@@ -142,7 +142,7 @@ def run_matrix_free(problem: Problem, options: Options, evaluate: Evaluate, know
     task = problem.task(options.tolerance)
     spread = options.loss_scale if options.loss_scale is not None else TUNING * (known.noise or 1.0)
     task = task._replace(spread=np.asarray(spread if options.loss != "linear" else 1.0))
-    products, x, record = _products(problem.residual, options.loss), np.asarray(problem.x, float), None
+    own, x, record = products(problem.residual, options.loss), np.asarray(problem.x, float), None
     if options.resume is not None:
         record = Record.of(options.resume, task, problem.stages, x, repr(problem.layout.shapes), options.loss)
     kept = None if record is None else record.load(Point)
@@ -153,7 +153,7 @@ def run_matrix_free(problem: Problem, options: Options, evaluate: Evaluate, know
             xs = starts_of(problem.layout, options, x, task, lambda: np.where(x != 0, np.abs(x), 1.0))
             alone = Watch(bar)
             ends = [
-                descend(products, beginning(one, problem.form.size), task, options.max_iterations, 0, [], alone)
+                descend(own, beginning(one, problem.form.size), task, options.max_iterations, 0, [], alone)
                 for one in xs
             ]
             x, starts = best_of(problem, ends)
@@ -163,7 +163,7 @@ def run_matrix_free(problem: Problem, options: Options, evaluate: Evaluate, know
                 continue
             if stage > first or kept is None:
                 point = beginning(point.x, problem.form.size, point.nonfinite)
-            point = descend(products, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
+            point = descend(own, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
     if not np.isfinite(point.total):
         raise ValueError(WITHOUT_A_START)
     state, words = start(point.x, 0, 1), ending(point, watch)

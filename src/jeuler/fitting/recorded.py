@@ -11,6 +11,8 @@ import numpy as np
 from jax import Array
 
 from jeuler._core import checks
+from jeuler.fitting.asked import ASKED
+from jeuler.fitting.beside import attached
 from jeuler.fitting.engine import Outcome, run
 from jeuler.fitting.forward import Forward
 from jeuler.fitting.mismatch import mismatched
@@ -30,7 +32,7 @@ from jeuler.fitting.problem import Problem
 from jeuler.fitting.sampling import aliased
 from jeuler.fitting.series import Columns, Series, column_names
 from jeuler.fitting.smoothness import alike_neighbours
-from jeuler.fitting.step_bias import RANDOM, bias_of_step
+from jeuler.fitting.step_bias import RANDOM, bias_of_many, bias_of_step
 from jeuler.fitting.two_starts import from_both
 from jeuler.fitting.unknowns import Layout
 from jeuler.fitting.weak_form import weak_form
@@ -270,6 +272,9 @@ class Recorded:
             words = [*words, RANDOM]
         elif step_bias and found.covariance is not None and outcome.state is not None:
             bias, more = bias_of_step(self, found, outcome.state)
+            words = [*words, *more]
+        elif step_bias and (asked := attached(found, ASKED)) is not None:
+            bias, more = bias_of_many(self, found, asked)
             words = [*words, *more]
         fields["message"] = "; ".join([fields["message"], *words])
         return fields, bias, scene, state, predicted

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jeuler.fitting import least_squares
+from jeuler.fitting.asked import Asked
 from jeuler.fitting.beside import attached
 from jeuler.fitting.factors import projected
 from jeuler.fitting.forward import Forward
 from jeuler.fitting.least_squares import State
-from jeuler.fitting.prediction import recording
+from jeuler.fitting.matrix_free import products
+from jeuler.fitting.prediction import compiled_positions, recording
 from jeuler.fitting.report import INVERSE
 from jeuler.fitting.result import Fit
 from jeuler.fitting.unknowns import Layout, readable
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from jeuler.fitting.recorded import Recorded
 
 TENTH = 0.1  # of a standard error: the least that is worth a word
+UNKNOWN = "the bias of the step is not computed for so many unknowns here: fit once more at half the dt and compare"
+NOT_FINITE_IN_HALVES = "at dt = {:g} the run is not finite, so the bias of the step is not known"
 RANDOM = "the run draws random numbers in each step, so the bias of the step is not known"
 
 
@@ -44,7 +49,7 @@ def shifted(
     """`bias_of_step` from the residuals in steps of dt and of dt / 2."""
     layout = Layout.of(found.params)
     if not np.isfinite(half).all():
-        return None, [f"at dt = {dt / 2:g} the run is not finite, so the bias of the step is not known"]
+        return None, [NOT_FINITE_IN_HALVES.format(dt / 2)]
     with np.errstate(all="ignore"):
         weights = np.where(whole != 0, state.residual[: len(whole)] / whole, 0)
     order = getattr(step, "order", 1)
@@ -58,13 +63,54 @@ def shifted(
     worst = int(np.argmax(share)) if share.size else 0
     if not share.size or share[worst] <= TENTH:
         return bias, []
-    advised = dt * min((TENTH / share[worst]) ** (1 / order), 0.5)
-    exponent = np.floor(np.log10(advised))
-    advised = np.floor(advised / 10 ** (exponent - 1)) * 10 ** (exponent - 1)
     return bias, [
         f"the integrator's error at dt = {dt:g} moves {layout.names(readable)[worst]} by {shift[worst]:.2g}, "
-        f"{share[worst]:.2g} standard errors (.step_bias): use dt = {advised:.2g}"
+        f"{share[worst]:.2g} standard errors (.step_bias): use dt = {_advised(dt, share[worst], order):.2g}"
     ]
+
+
+def bias_of_many(task: Recorded, found: Fit, asked: Asked) -> tuple[Any, list[str]]:
+    """`bias_of_step` without a Jacobian, by the damped step of the search: for so many unknowns that all errors lack.
+
+        share = sqrt(|J shift|^2 / n) / sigma,   the root mean square of the shifts in standard errors
+
+    over the directions that the data determine, for independent noise. One number may be moved by more of its own.
+    """
+    problem, step = asked.problem, task.prediction.step
+    if problem.residual.priors is not None:
+        return None, [UNKNOWN]
+    steps = 2 * task.prediction.num_steps
+    finer = dataclasses.replace(task.prediction, num_steps=steps)
+    columns, observed = np.asarray(task.prediction.columns, int), np.asarray(task.data["observed"])
+    how: dict[str, Any] = {"t0": task.t0, "num_steps": steps, "key": task.key}
+    halved = recording(task.scene, task.state, task.times, task.targets, columns, dt=task.dt / 2, **how)
+    runs = ((task.prediction, task.data), (finer, halved))
+    whole, half = (np.asarray(compiled_positions(p)(found.params, data), float) for p, data in runs)
+    whole, half = (run.reshape(len(run), -1)[:, columns] for run in (whole, half))
+    if not np.isfinite(half[observed]).all():
+        return None, [NOT_FINITE_IN_HALVES.format(task.dt / 2)]
+    order = getattr(step, "order", 1)
+    change = np.where(observed, (half - whole) * 2**order / (2**order - 1), 0)
+    # measured so that the residual is the change, the step of the search is -J^+ of it: from fitted to exact
+    as_if = asked.task._replace(data={**task.data, "targets": np.where(observed, whole - change, 0)})
+    shift, decrease = products(problem.residual, asked.loss).step(asked.state.x, as_if, np.asarray(0.0))
+    freedom = max(int(np.sum(np.asarray(asked.task.weights) > 0)) - len(asked.state.x), 1)
+    variance = 1.0 if problem.absolute else float(np.sum(asked.state.residual**2)) / freedom
+    share = float(np.sqrt(max(float(decrease), 0.0) / len(asked.state.x) / max(variance, 1e-300)))
+    bias = problem.layout.params(-np.asarray(shift, float))
+    if not share > TENTH:
+        return bias, []
+    return bias, [
+        f"the integrator's error at dt = {task.dt:g} moves the unknowns by {share:.2g} standard errors, root mean "
+        f"square (.step_bias): use dt = {_advised(task.dt, share, order):.2g}"
+    ]
+
+
+def _advised(dt: float, share: float, order: int) -> float:
+    """The dt at which the bias is a tenth of a standard error, rounded down to two digits."""
+    advised = dt * min((TENTH / share) ** (1 / order), 0.5)
+    unit = 10 ** (np.floor(np.log10(advised)) - 1)
+    return float(np.floor(advised / unit) * unit)
 
 
 def _residuals(task: Recorded, layout: Layout, found: Fit) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeuler._core import checks
+from jeuler.fitting.asked import ASKED
+from jeuler.fitting.beside import attached
 from jeuler.fitting.engine import Outcome, run
 from jeuler.fitting.measured.form import (
     as_positions,
@@ -33,7 +35,7 @@ from jeuler.fitting.problem import Problem
 from jeuler.fitting.result import Fit
 from jeuler.fitting.series import Columns, Series, column_names, one_after_another
 from jeuler.fitting.smoothness import alike_neighbours
-from jeuler.fitting.step_bias import RANDOM, shifted
+from jeuler.fitting.step_bias import RANDOM, UNKNOWN, shifted
 from jeuler.fitting.two_starts import from_both
 from jeuler.fitting.weak_form import weak_form
 from jeuler.particles.fields import draws
@@ -299,6 +301,8 @@ class Several:
             whole = self._off(predicted)
             bias, more = shifted(whole, self._in_halves(found), self.dt, self.residual.step, found, outcome.state)
             fields["message"] = "; ".join([fields["message"], *more])
+        elif step_bias and attached(found, ASKED) is not None:
+            fields["message"] = "; ".join([fields["message"], UNKNOWN])
         if self.single:
             return fields, bias, scene, states[0], predicted[0]
         return fields, bias, scene, states, predicted
