@@ -13,6 +13,9 @@ from jax import Array
 from jeuler._core.vectors import direction, length, unit
 from jeuler.contact.paths import Path
 
+DENSE_UP_TO = 96  # unknowns of the contacts at rest that are solved for by a matrix
+NARROWER = 8  # reaches, each half of the one before, that are tried where pairs are more than there is room for
+WAY_OF_FORCES = 1e3  # of an approach that is none, is the way that the forces of a step make
 TOUCH, LIFT = 8, 16  # units in the last place of the coordinates
 CANDIDATES = 2  # pairs followed in a step, for each particle and dimension, where there are many more of them
 
@@ -84,10 +87,35 @@ class Contacts:
     def count(self) -> int:
         return self.walls + len(self.i)
 
+    @property
+    def alone(self) -> bool:
+        """Whether each particle has one contact at most."""
+        return len(self.colliders) == 1 and not len(self.i)
+
+    @property
+    def many(self) -> bool:
+        """Whether the contacts at rest are solved for by iterations alone."""
+        return self.count * (self.dim + 1) > DENSE_UP_TO
+
+    def open(self, slow: Array) -> Array:
+        """Up to which gap, (contact,), m, a contact that is slow rests; slow: an approach that is none, m a step.
+
+        What the solve of the step before may have left; among many contacts, the way that the forces of a step make.
+        """
+        return (WAY_OF_FORCES if self.many else 1e-3) * slow
+
+    def landing(self, gap: Array, normal: Array) -> Array:
+        """The relative velocity, (contact, dim), with which what rests at a distance may close its gap in this step.
+
+        Source: D. E. Stewart, J. C. Trinkle, International Journal for Numerical Methods in Engineering 39, 1996.
+        """
+        return jnp.maximum(gap, 0)[:, None] / self.dt * normal if self.many else jnp.zeros_like(normal)
+
     def near(self, path: Path) -> None:
         """Where there are many pairs, keep those that can meet in this step, and count those beyond the capacity.
 
-        Balls that are further apart than four times the longest way of any of them do not meet.
+        Balls that are further apart than four times the longest way of any of them do not meet. Where too many are
+        nearer, the nearest are kept.
         """
         capacity = CANDIDATES * self.dim * self.particles
         if len(self.i) <= 2 * capacity:
@@ -95,10 +123,14 @@ class Contacts:
         way = jax.lax.stop_gradient(length(path.way) + length(path.bend))
         x = jax.lax.stop_gradient(path.x)
         apart = length(x[self.i] - x[self.j]) - self.radius[self.i] - self.radius[self.j]
-        can = (apart <= 4 * jnp.max(way)) & self.alive[self.i] & self.alive[self.j]
-        kept = jnp.nonzero(can, size=capacity, fill_value=0)[0]
-        number = jnp.sum(can)
-        self.left_out = jnp.maximum(number - capacity, 0).astype(jnp.int32)
+        alive = self.alive[self.i] & self.alive[self.j]
+        reaches = 4 * jnp.max(way) * 0.5 ** jnp.arange(NARROWER, dtype=apart.dtype)
+        numbers = jnp.sum((apart <= reaches[:, None]) & alive, axis=1)
+        widest = jnp.argmax(numbers <= capacity)  # the widest reach that has room; without any, the narrowest
+        widest = jnp.where(jnp.any(numbers <= capacity), widest, NARROWER - 1)
+        kept = jnp.nonzero((apart <= reaches[widest]) & alive, size=capacity, fill_value=0)[0]
+        number = jnp.minimum(numbers[widest], capacity)
+        self.left_out = (numbers[0] - number).astype(jnp.int32)
         self.i, self.j = self.i[kept], self.j[kept]
         self.listed = jnp.arange(capacity) < number
 
@@ -153,6 +185,29 @@ class Contacts:
             for body, part in ((self.i, first / response), (self.j, -second / response)):
                 total = total.at[body].add(part.reshape(-1, *[1] * (change.ndim - 1)) * pairs)
         return total
+
+    def close(self, active: Array, gap: Array) -> Array:
+        """Who touches, or may be pushed into, (contact,)."""
+        return active | (self.possible() & (gap < 0.1 * self.both(jnp.add, self.radius)))
+
+    def rate(self, of: Array) -> Array:
+        """One over the number of these contacts, (contact,), that the partner with more of them has."""
+        one = of.astype(self.radius.dtype)
+        return 1 / self.both(jnp.maximum, jnp.maximum(self.gather(one, -one), 1))
+
+    def chosen(self, of: Array) -> tuple[Contacts | Chosen, Array]:
+        """These contacts, (contact,), alone in a list where they are few among many, and their numbers in it."""
+        capacity = CANDIDATES * self.dim * self.particles
+        numbers = jnp.arange(self.count)
+        if 2 * self.count <= 3 * capacity or self.count * (self.dim + 1) <= 4 * DENSE_UP_TO:
+            return self, numbers
+        kept = jnp.nonzero(of, size=capacity, fill_value=self.count)[0]
+        body = jnp.arange(self.particles, dtype=jnp.int32)
+        none = jnp.full(self.walls, self.particles, jnp.int32)  # a collider is one more particle, which stays
+        i = jnp.concatenate([jnp.tile(body, len(self.colliders)), self.i.astype(jnp.int32)])
+        j = jnp.concatenate([none, self.j.astype(jnp.int32)])
+        i, j = (jnp.where(kept < self.count, k[kept], self.particles) for k in (i, j))
+        return Chosen(i, j, jnp.pad(self.inverse_mass, (0, 1)), self.friction, self.dt, kept < self.count), kept
 
     def look(self, path: Path, s: Array) -> Look:
         """Gap, normal and relative motion of each contact, with its partners where they are at its own s."""
@@ -213,3 +268,37 @@ class Contacts:
                 if m != own
             ]
             self.lift[k] = jax.lax.stop_gradient(sum(others[1:], others[0]))
+
+
+class Chosen(NamedTuple):
+    """Some of the contacts of a step, in a list; with methods as those of `Contacts`."""
+
+    i: Array  # (contact,), the first particle; the number of particles in an empty slot
+    j: Array  # (contact,), the second; the number of particles for a collider
+    inverse_mass: Array  # (particle + 1,), 1/kg
+    friction: Array
+    dt: Array
+    listed: Array  # (contact,), False in empty slots
+
+    alone, many = False, True
+
+    def close(self, active: Array, gap: Array) -> Array:
+        return self.listed
+
+    def rate(self, of: Array) -> Array:
+        one = of.astype(self.dt.dtype)
+        number = jnp.zeros_like(self.inverse_mass).at[self.i].add(one).at[self.j].add(one).at[-1].set(0)
+        return 1 / jnp.maximum(jnp.maximum(number[self.i], number[self.j]), 1)
+
+    def relative(self, y: Array) -> Array:
+        y = jnp.pad(y, ((0, 1), *[(0, 0)] * (y.ndim - 1)))
+        return y[self.i] - y[self.j]
+
+    def move(self, change: Array) -> Array:
+        first, second = self.inverse_mass[self.i], self.inverse_mass[self.j]
+        response = jnp.where(first + second > 0, first + second, 1)
+        shares = (part.reshape(-1, *[1] * (change.ndim - 1)) for part in (first / response, second / response))
+        total = jnp.zeros((len(self.inverse_mass), *change.shape[1:]), change.dtype)
+        for body, part in zip((self.i, self.j), shares, strict=True):
+            total = total.at[body].add((part if body is self.i else -part) * change)
+        return total[:-1]

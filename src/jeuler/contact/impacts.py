@@ -64,8 +64,14 @@ def rounding_of_speed(contacts: Contacts, path: Path) -> Array:
 
 
 def impulsive_limit(contacts: Contacts, normal: Array, path: Path) -> Array:
-    """The speed of approach, m a step, up to which an impact is one that the step itself can make: it is plastic."""
-    made = jnp.abs(jnp.sum(contacts.relative(path.bend) * normal, axis=-1))
+    """The speed of approach, m a step, up to which an impact is one that the step itself can make: it is plastic.
+
+    Among many contacts each partner may be held by others, so that the forces on the other one make it.
+    """
+    if contacts.many:
+        made = contacts.both(jnp.add, length(path.bend))
+    else:
+        made = jnp.abs(jnp.sum(contacts.relative(path.bend) * normal, axis=-1))
     return 1.001 * made + rounding_of_speed(contacts, path)
 
 
@@ -92,9 +98,11 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     small = contacts.roundoff(path.x)
     first = contacts.look(path, start)
     limit = impulsive_limit(contacts, first.normal, path) + slow
-    touching = first.gap <= small
     rests = contacts.resting & ~contacts.both(jnp.logical_or, path.hit)  # still as it was held from the start
-    now = touching & (-first.slope > jnp.where(rests, limit, rounding_of_speed(contacts, path) + slow))
+    none = small + jnp.where(rests, contacts.open(slow), 0)
+    touching = first.gap <= none
+    held = jnp.inf if contacts.many else limit
+    now = touching & (-first.slope > jnp.where(rests, held, rounding_of_speed(contacts, path) + slow))
     lowest = jnp.where(now, start - 1, start)
     turn = length(contacts.relative(path.bend))
     fastest = length(first.speed) + turn
@@ -120,7 +128,7 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
         newtons = newtons + jnp.where((n > 0) & ~far, 1, 0)
         look = contacts.look(path, s)
         newtons = jnp.where((newtons > 0) & (jnp.abs(look.gap) <= small / TOUCH), NEWTON_STEPS, newtons)
-        apart = jnp.where(n == 0, ~now & (look.gap > small), apart)
+        apart = jnp.where(n == 0, ~now & (look.gap > none), apart)
         return s, look, apart, jnp.where(now | apart, newtons, NEWTON_STEPS), n + 1
 
     begin = start + jnp.where(touching & ~now, 1e-3, 0)  # who leaves may come back

@@ -19,6 +19,7 @@ implicit function theorem on the active set.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -30,9 +31,8 @@ from jax.ad_checkpoint import checkpoint_name
 from jeuler._core.vectors import length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
-from jeuler.contact.contacts import Contacts
+from jeuler.contact.contacts import DENSE_UP_TO, Chosen, Contacts
 
-DENSE_UP_TO = 96  # unknowns; beyond, matrix-free
 ITERATIONS = 400
 REFINEMENTS = 3
 REST = "contacts at rest"
@@ -51,7 +51,7 @@ class Rest(NamedTuple):
 class Problem(NamedTuple):
     """The equations of the contacts at rest."""
 
-    contacts: Contacts
+    contacts: Contacts | Chosen
     normal: Array  # (contact, dim)
     velocity: Array  # (contact, dim), relative, at the end of the step without contact, m/s
     gap: Array  # (contact,), at the end of the step without contact, over dt, m/s
@@ -79,12 +79,29 @@ class Problem(NamedTuple):
     def weak(self) -> Array:
         """A push, m/s, that may be a rounding, or what the iterations leave."""
         speed = jnp.max(length(lax.stop_gradient(self.velocity)), initial=0)
-        return 100 * _relative_tolerance(speed.dtype) * speed
+        return 100 * self.relative_tolerance() * speed
+
+    def relative_tolerance(self) -> float:
+        """How near to the fixed point the iterations come, in parts of the largest velocity of the problem."""
+        return max(1e-6 if self.contacts.many else 1e-9, 30 * float(jnp.finfo(self.velocity.dtype).eps))
 
     def close(self) -> Array:
         """Who touches, or may be pushed into, (contact,)."""
-        reach = 0.1 * self.contacts.both(jnp.add, self.contacts.radius)
-        return self.active | (self.contacts.possible() & (self.contacts.dt * self.clear < reach))
+        return self.contacts.close(self.active, self.contacts.dt * self.clear)
+
+    def listed(self) -> tuple[Problem, Array]:
+        """The problem of those that are close, where they are few among many, and their numbers here."""
+        contacts, kept = self.contacts.chosen(self.close())
+        if contacts is self.contacts:
+            return self, kept
+
+        def of(y):
+            return y.at[kept].get(mode="fill", fill_value=0)
+
+        own = Problem(
+            contacts, of(self.normal), of(self.velocity), of(self.gap), self.theta, of(self.active), of(self.clear)
+        )
+        return own, kept
 
     def at_end(self, w: Array, q: Array) -> tuple[Array, Array, Array]:
         """The relative velocity with the impulses w, (contact, dim), the gap over dt without q, and with it."""
@@ -96,19 +113,20 @@ class Problem(NamedTuple):
         gap = jnp.where(self.active, self.gap + self.push(moved), self.clear)
         return self.velocity + kick, gap, gap + self.push(shift)
 
-    def improve(self, u: Array, rate: Array, small: Array) -> Array:
-        """The projection of which the answer is a fixed point. u holds w, and in its last column q.
+    def better_push(self, w: Array, rate: Array) -> Array:
+        """The projection of which the impulses, (contact, dim), are a fixed point."""
+        velocity = self.velocity + self.contacts.relative(self.contacts.move(w))
+        return self.project(w - rate[:, None] * velocity)
+
+    def better_shift(self, q: Array, rate: Array, small: Array, gap: Array, pressed: Array, close: Array) -> Array:
+        """The projection of which the displacements, (contact,), over dt are a fixed point.
 
         Overlaps are closed, down to ``small``. What presses is drawn together too, each by no more than its own gap, so
         that gaps that cannot all be 0 at once leave it where it is.
         """
-        w, q = u[:, :-1], u[:, -1]
-        velocity, gap, left = self.at_end(w, q)
-        pressed = self.push(w) > 0
+        left = gap + self.push(self.contacts.relative(self.contacts.move(q[:, None] * self.normal)))
         lowest = jnp.where(pressed, -jnp.maximum(gap, 0), 0)
-        q = jnp.where(self.close(), jnp.maximum(q - rate * (left + jnp.where(pressed, 0, small)), lowest), 0)
-        w = self.project(w - rate[:, None] * velocity)
-        return jnp.concatenate([w, q[:, None]], axis=1)
+        return jnp.where(close, jnp.maximum(q - rate * (left + jnp.where(pressed, 0, small)), lowest), 0)
 
     def residual(self, u: Array, rate: Array, on: Array, overlap: Array) -> Array:
         """What is 0 at the answer where the gaps ``on`` are closed, down to an overlap; it has derivatives."""
@@ -118,28 +136,43 @@ class Problem(NamedTuple):
         return jnp.concatenate([unmoved, jnp.where(on, left + overlap, q)[:, None]], axis=1)
 
 
-def at_rest(problem: Problem, small: Array, loaded: Problem | None = None) -> Rest:
+def at_rest(problem: Problem, small: Array, load: Array | None = None) -> Rest:
     """The answer of the contacts that are active. Overlaps of ``small``, (contact,), m, are none.
 
-    Where its velocities may hold this answer already, ``loaded`` is the problem with those that do not: what presses
-    there, and touches at both ends of the step, acts.
+    Where its velocities may hold this answer already, ``load``, (contact, dim), are those that do not: what presses
+    under them, and touches at both ends of the step, acts.
     """
+    own, kept = problem.listed()
+    if own is problem:
+        return _at_rest(problem, small, load)
+    rest = _at_rest(own, small.at[kept].get(mode="clip"), None if load is None else load.at[kept].get(mode="clip"))
+    without = jnp.sum(problem.close()) - jnp.sum(own.close())
+    on = jnp.zeros(len(small), bool).at[kept].set(rest.on, mode="drop")
+    gap = jnp.zeros_like(small).at[kept].set(rest.gap, mode="drop")
+    return rest._replace(on=on, gap=gap, unresolved=rest.unresolved + without.astype(jnp.int32))
+
+
+def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
-        stays = False if loaded is None else (jnp.abs(problem.gap) <= small + problem.weak()) & pressing(loaded, small)
+        if load is not None:
+            loaded = problem._replace(velocity=load)
+            stays = (jnp.abs(problem.gap) <= small + problem.weak()) & pressing(loaded, small)
+        else:
+            stays = False
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
-    if len(contacts.colliders) == 1 and not len(contacts.i):  # each particle for itself: exact at once
+    if contacts.alone:  # each particle for itself: exact at once
         w = problem.project(-problem.velocity)
         gap = problem.gap + problem.push(problem.theta * w)
         on = pressed(w, problem.velocity + w) | lax.stop_gradient(active & (gap < -small))
         u = jnp.concatenate([w, jnp.where(on, -gap, 0)[:, None]], axis=1)
         unresolved = jnp.int32(0)
     else:
-        rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, problem.close()))
-        start, error = checkpoint_name(_iterate(lax.stop_gradient(problem), rate, small), REST)
+        rate = contacts.rate(active)
+        start, error = checkpoint_name(_iterate(lax.stop_gradient(problem), small), REST)
         unresolved = jnp.sum(active & (error > _tolerated(problem) + small)).astype(jnp.int32)
         w, q = start[:, :-1], start[:, -1]
         velocity, gap, _ = problem.at_end(w, q)
@@ -156,33 +189,17 @@ def at_rest(problem: Problem, small: Array, loaded: Problem | None = None) -> Re
 
 def pressing(problem: Problem, small: Array) -> Array:
     """Which contacts, (contact,), push in the answer; overlaps of ``small``, over dt, m/s, are none. No derivative."""
-    if len(problem.contacts.colliders) == 1 and not len(problem.contacts.i):
+    if problem.contacts.alone:
         return problem.push(problem.project(-problem.velocity)) > problem.weak()
-    rate = 1 / problem.contacts.both(jnp.maximum, _number_of_contacts(problem.contacts, problem.close()))
-    return problem.push(_iterate(lax.stop_gradient(problem), rate, small)[0][:, :-1]) > problem.weak()
+    return problem.push(_impulses(lax.stop_gradient(problem), small)[0]) > problem.weak()
 
 
 def together(problem: Problem, small: Array) -> tuple[Array, Array]:
     """The kick, m/s, and the shift, m, of the contacts that are active, (particle, dim), without derivative."""
+    problem, kept = problem.listed()
     contacts = problem.contacts
-    rate = 1 / contacts.both(jnp.maximum, _number_of_contacts(contacts, problem.close()))
-    u, _ = _iterate(problem, rate, small / contacts.dt)
+    u, _ = _iterate(problem, small.at[kept].get(mode="clip") / contacts.dt)
     return contacts.move(u[:, :-1]), contacts.dt * contacts.move(u[:, -1:] * problem.normal)
-
-
-def _number_of_contacts(contacts: Contacts, active: Array) -> Array:
-    one = active.astype(contacts.radius.dtype)
-    total = jnp.zeros_like(contacts.radius)
-    for k in range(len(contacts.colliders)):
-        total = total + one[k * contacts.particles : (k + 1) * contacts.particles]
-    if len(contacts.i):
-        total = total.at[contacts.i].add(one[contacts.walls :]).at[contacts.j].add(one[contacts.walls :])
-    return jnp.maximum(total, 1)
-
-
-def _relative_tolerance(dtype: Any) -> float:
-    """How near to the fixed point the iterations come, in parts of the largest velocity of the problem."""
-    return max(1e-9, 30 * float(jnp.finfo(dtype).eps))
 
 
 def _tolerated(problem: Problem) -> Array:
@@ -192,19 +209,47 @@ def _tolerated(problem: Problem) -> Array:
     return 1e-3 * jnp.max(jnp.where(problem.active, speed, 0), initial=0) + rounding
 
 
-def _iterate(problem: Problem, rate: Array, small: Array) -> tuple[Array, Array]:
-    """The fixed point (contact, dim + 1) by accelerated iterations, and how far each contact, m/s, is from it."""
-    velocity = problem.velocity
-    enough = _relative_tolerance(velocity.dtype) * jnp.max(length(velocity), initial=0)
-    enough = enough + 0.01 * jnp.min(small, initial=jnp.inf)
+def _iterate(problem: Problem, small: Array) -> tuple[Array, Array]:
+    """The impulses, and in the last column displacements over dt, (contact, dim + 1), without derivative; and how far
+    each contact, m/s, is from the fixed points."""
+    w, far = _impulses(problem, small)
+    _, gap, _ = problem.at_end(w, jnp.zeros_like(small))
+    close, pressed = problem.close(), problem.push(w) > 0
+    rate = problem.contacts.rate(close)
+
+    def better(q):
+        return problem.better_shift(q, rate, small, gap, pressed, close)
+
+    q, off = _accelerated(better, jnp.zeros_like(small), rate, _enough(problem, small), problem.active)
+    return jnp.concatenate([w, q[:, None]], axis=1), jnp.maximum(far, off)
+
+
+def _impulses(problem: Problem, small: Array) -> tuple[Array, Array]:
+    """The impulses, (contact, dim), and how far each contact, m/s, is from the fixed point."""
+    rate = problem.contacts.rate(problem.active)
+    start = jnp.zeros_like(problem.velocity)
+    better = functools.partial(problem.better_push, rate=rate)
+    return _accelerated(better, start, rate, _enough(problem, small), problem.active)
+
+
+def _enough(problem: Problem, small: Array) -> Array:
+    fastest = jnp.max(length(problem.velocity), initial=0)
+    return problem.relative_tolerance() * fastest + 0.01 * jnp.min(small, initial=jnp.inf)
+
+
+def _accelerated(
+    better: Callable[[Array], Array], start: Array, rate: Array, enough: Array, active: Array
+) -> tuple[Array, Array]:
+    """The fixed point by accelerated iterations with restarts, and how far each contact, m/s, is from it."""
 
     def one(state):
         u, ahead, weight, _, k = state
-        new = problem.improve(ahead, rate, small)
+        new = better(ahead)
         restart = jnp.sum((ahead - new) * (new - u)) > 0
-        weight = jnp.where(restart, 1.0, weight).astype(velocity.dtype)
+        weight = jnp.where(restart, 1.0, weight).astype(start.dtype)
         next_weight = (1 + jnp.sqrt(1 + 4 * weight**2)) / 2
-        error = length(new - ahead) / rate
+        change = new - ahead
+        error = (length(change) if change.ndim > 1 else jnp.abs(change)) / rate
         ahead = new + jnp.where(restart, 0, (weight - 1) / next_weight) * (new - u)
         return new, ahead, next_weight, error, k + 1
 
@@ -212,9 +257,8 @@ def _iterate(problem: Problem, rate: Array, small: Array) -> tuple[Array, Array]
         *_, error, k = state
         return (jnp.max(error, initial=0) > enough) & (k < ITERATIONS)
 
-    zero = jnp.pad(jnp.zeros_like(velocity), ((0, 0), (0, 1)))
-    error = jnp.where(problem.active, jnp.inf, jnp.zeros_like(rate))
-    u, _, _, error, _ = lax.while_loop(go_on, one, (zero, zero, jnp.ones((), velocity.dtype), error, 0))
+    error = jnp.where(active, jnp.inf, jnp.zeros_like(rate))
+    u, _, _, error, _ = lax.while_loop(go_on, one, (start, start, jnp.ones((), start.dtype), error, 0))
     return u, error
 
 

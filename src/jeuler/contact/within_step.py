@@ -79,8 +79,8 @@ def settle(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tupl
     """
     end = contacts.look(path, jnp.ones_like(contacts.both(jnp.add, path.s)))
     small = contacts.roundoff(path.x)
-    touches = (end.gap <= small + 1e-3 * slow) & contacts.possible()
-    speed = contacts.relative(velocity) + end.recession[:, None] * end.normal
+    touches = (end.gap <= small + contacts.open(slow)) & contacts.possible()
+    speed = contacts.relative(velocity) + end.recession[:, None] * end.normal + contacts.landing(end.gap, end.normal)
     gap = end.gap / contacts.dt
     problem = Problem(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
     return together(problem, small)
@@ -104,7 +104,7 @@ def answer(contacts: Contacts, x: Array, v: Array, acceleration: Array) -> Calla
     standing = jnp.zeros((len(x), 1), x.dtype)
 
     def kick(u):
-        velocity = contacts.relative(u) + recession[:, None] * normal
+        velocity = contacts.relative(u) + recession[:, None] * normal + contacts.landing(gap, normal)
         return at_rest(Problem(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0), small).kick
 
     return kick
@@ -128,14 +128,15 @@ def hold(
     """The paths with the forces of what touches at the start and does not bounce, the velocity at their end, who is
     touched by them, the number of contacts that are not resolved, and who has a collider without a distance there."""
     (gap, _, normal, recession, _), small, stays = at_start(contacts, free_path(x, displacement, dv, contacts.dt), slow)
-    end_speed = contacts.relative(v + dv) + recession[:, None] * normal
+    surface = recession[:, None] * normal + contacts.landing(gap, normal)
+    end_speed = contacts.relative(v + dv) + surface
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
     problem = Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt)
     if load is None:
         rest = at_rest(problem, small)
     else:
-        speed = contacts.relative(load) + recession[:, None] * normal
-        rest = at_rest(problem, small, problem._replace(velocity=speed))
+        speed = contacts.relative(load) + surface
+        rest = at_rest(problem, small, speed)
     radius = contacts.both(jnp.add, contacts.radius)
     unclear = stays & (radius > 0) & (small > 0.05 * radius)  # far from the origin nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | unclear).astype(jnp.int32)
@@ -153,7 +154,7 @@ def at_start(contacts: Contacts, path: Path, slow: Array) -> tuple[Look, Array, 
     start = contacts.look(path, jnp.zeros_like(contacts.both(jnp.add, path.s)))
     small = contacts.roundoff(path.x)
     slowly = -start.slope <= impulsive_limit(contacts, start.normal, path) + slow
-    touches = start.gap <= small + 1e-3 * slow  # what the solve of the step before may have left open
+    touches = start.gap <= small + contacts.open(slow)
     return start, small, lax.stop_gradient(touches & slowly & contacts.possible())
 
 
