@@ -2,6 +2,7 @@
 
 python benchmarks/contact.py exact [scenes]
 python benchmarks/contact.py fuzz [scenes] [seed] [part of a shape's name]
+python benchmarks/contact.py heap [steps]
 """
 
 import collections
@@ -15,6 +16,8 @@ from arguments import REQUIRED, arguments
 
 sys.path[:0] = [str(pathlib.Path(__file__).resolve().parent.parent / "tests" / name) for name in ("", "contact")]
 import contact_scenes  # noqa: E402
+
+import jeuler  # noqa: E402
 
 
 def fuzz(scenes, seed, only):
@@ -87,11 +90,50 @@ def exact(scenes):
         )
 
 
+def heap(steps, balls=150, radius=0.1, dt=1 / 60):
+    """Heaps between walls, all pairs named: one packed and let go at rest, one that falls together first."""
+    row, column = np.divmod(np.arange(balls), 15)
+    packed = np.stack([radius * (1 + row % 2 + 2 * column), radius * (1 + np.sqrt(3) * row)], axis=1)
+    loose = np.stack([0.11 + 0.25 * column + 0.01 * (row % 2), 0.11 + 0.21 * row], axis=1)
+    for name, position, width in (("packed", packed, 3.1), ("falls together", loose, 3.72)):
+        walls = [([0.0, 0.0], [0.0, 1.0]), ([0.0, 0.0], [1.0, 0.0]), ([width, 0.0], [-1.0, 0.0])]
+        contact = jeuler.Collisions(
+            tuple(jeuler.Plane(*wall) for wall in walls),
+            pairs=np.stack(np.triu_indices(balls, 1), 1),
+            radius=radius,
+            restitution=0.3,
+            friction=0.3,
+        )
+        scene = jeuler.Scene((jeuler.Gravity([0.0, -9.8]),), (contact,))
+        run = jax.jit(
+            lambda state, scene=scene: jeuler.simulate(
+                scene, state, dt=dt, num_steps=steps, save_every=steps, step=jeuler.symplectic_euler_step
+            )
+        )
+        state = jeuler.ParticleState(position, np.zeros_like(position))
+        middle = jax.block_until_ready(run(state))
+        state = jeuler.ParticleState(middle.y.position[-1], middle.y.velocity[-1])
+        begin, spent = time.perf_counter(), time.process_time()
+        end = jax.block_until_ready(run(state))
+        moved = np.abs(end.y.position[-1] - state.position).max()
+        wall, cpu = (
+            1e3 * (now - then) / steps for now, then in ((time.perf_counter(), begin), (time.process_time(), spent))
+        )
+        print(
+            f"{name}: after {steps} steps at most {np.abs(middle.y.velocity[-1]).max():.2g} m/s, unresolved "
+            f"{int(middle.unresolved_contacts)}; in as many more moved {moved:.2g} m, "
+            f"unresolved {int(end.unresolved_contacts)}, {wall:.2f} ms a step ({cpu:.2f} ms of CPU)",
+            flush=True,
+        )
+
+
 def main():
     given = arguments(__doc__, what=REQUIRED, scenes=None, seed="0", shape="")
     jax.config.update("jax_enable_x64", True)
     if given.what == "exact":
         exact(int(given.scenes or 100))
+    elif given.what == "heap":
+        heap(int(given.scenes or 120))
     elif given.what == "fuzz":
         fuzz(int(given.scenes or 2000), int(given.seed), given.shape)
     else:
