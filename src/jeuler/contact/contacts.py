@@ -94,8 +94,8 @@ class Contacts:
 
     @property
     def many(self) -> bool:
-        """Whether the contacts at rest are solved for by iterations alone."""
-        return self.count * (self.dim + 1) > DENSE_UP_TO
+        """Whether there are so many pairs that what rests together is solved for by iterations alone."""
+        return len(self.i) * (self.dim + 1) > DENSE_UP_TO
 
     def open(self, slow: Array) -> Array:
         """Up to which gap, (contact,), m, a contact that is slow rests; slow: an approach that is none, m a step.
