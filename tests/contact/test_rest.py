@@ -36,7 +36,7 @@ def test_packed_heap_stays_and_one_that_falls_together_comes_to_rest():
     box = (FLOOR, Plane([0.0, 0.0], [1.0, 0.0]), Plane([1.0, 0.0], [-1.0, 0.0]))
     pairs = np.stack(np.triu_indices(24, 1), 1)
     heap = Collisions(box, pairs=pairs, radius=0.1, restitution=0.3, friction=0.3, max_bounces=4)
-    how = dict(dt=0.01, num_steps=100, save_every=10, step=jeuler.symplectic_euler_step)
+    how = {"dt": 0.01, "num_steps": 100, "save_every": 10, "step": jeuler.symplectic_euler_step}
     fall = jax.jit(lambda position: run(heap, position, 0 * position, **how))
     for position in packed, loose:
         end = fall(position)
