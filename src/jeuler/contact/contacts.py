@@ -280,7 +280,13 @@ class Chosen(NamedTuple):
     dt: Array
     listed: Array  # (contact,), False in empty slots
 
-    alone, many = False, True
+    @property
+    def alone(self) -> bool:
+        return False
+
+    @property
+    def many(self) -> bool:
+        return True
 
     def close(self, active: Array, gap: Array) -> Array:
         return self.listed

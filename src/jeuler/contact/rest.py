@@ -91,6 +91,8 @@ class Problem(NamedTuple):
 
     def listed(self) -> tuple[Problem, Array]:
         """The problem of those that are close, where they are few among many, and their numbers here."""
+        if isinstance(self.contacts, Chosen):
+            return self, jnp.arange(len(self.active))
         contacts, kept = self.contacts.chosen(self.close())
         if contacts is self.contacts:
             return self, kept
@@ -157,11 +159,10 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     small = small / contacts.dt
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
+        stays = jnp.zeros_like(active)
         if load is not None:
             loaded = problem._replace(velocity=load)
             stays = (jnp.abs(problem.gap) <= small + problem.weak()) & pressing(loaded, small)
-        else:
-            stays = False
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
     if contacts.alone:  # each particle for itself: exact at once
