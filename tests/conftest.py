@@ -19,4 +19,4 @@ def random():
     return np.random.default_rng(20240229)
 
 
-collect_ignore = ["_jax/on_a_mesh.py"]  # a program that a test runs in a process with eight devices
+collect_ignore = ["_jax/on_a_mesh.py", "particles/on_devices.py"]  # programs that tests run with eight devices

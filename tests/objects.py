@@ -81,6 +81,7 @@ RESULTS = {
     "Solution": solution,
     "Ensemble": lambda: jeuler.ensemble(jnp.sin, jnp.ones(2)),
     "Moments": lambda: jeuler.Moments(),
+    "Division": lambda: jeuler.divide(jeuler.Scene((hanging()[0].forces[0],)), hanging()[1], devices=1),
     "Quantiles": lambda: jeuler.Quantiles((0.5,), bounds=(0.0, 1.0)),
     "AdaptiveSolution": lambda: jeuler.solve_adaptive(decay, 1.0, t1=1.0, rtol=1e-3, max_steps=16),
     "Fit": lambda: jeuler.fit(line, {"slope": 1.0, "unused": 2.0}, max_iterations=3),
@@ -104,6 +105,7 @@ RESULTS = {
     "Setup": jeuler.scenes.fountain,
     "Camera": lambda: jeuler.plotting.Camera(width=3.0),
     "Look": jeuler.plotting.Look,
+    "Hair": lambda: jeuler.plotting.Hair.grown([[0, 1]], np.arange(6.0).reshape(1, 2, 3), strands=3, spread=0.1),
     "Film": lambda: jeuler.plotting.animate(solution(), hanging()[0]),
 }
 STEPS = {

@@ -84,7 +84,7 @@ def topology(edges: Any) -> Topology:
         except (TypeError, ValueError):  # rows of several lengths, or traced: told by what follows
             return Topology(edges)
         if array.dtype.kind in "iu":
-            key = array.shape, array.dtype, hashlib.sha1(np.ascontiguousarray(array)).digest()
+            key = array.shape, array.dtype, hashlib.sha1(array.tobytes()).digest()
             made = _made.get(key)
             if made is None:
                 made = _made[key] = Topology(array)
