@@ -74,7 +74,7 @@ def charge(agents: int = 5000) -> Setup:
     near = Neighbours(cutoff=1.2, skin=0.8, capacity=48, cell_capacity=48)
     rocks = tuple(PointAttractor([x, y, float(height(x, y))], -60.0 * r, softening=r) for x, y, r in ROCKS)
     limit = SpeedLimit(random.normal(7.0, 0.8, agents).clip(4.0, 9.0))
-    apart = SoftRepulsion(near, diameter=1.1, ks=60.0, kd=4.0)
+    apart = SoftRepulsion(near, diameter=1.1, ks=90.0, kd=4.0)
     scene = Scene((run_to_goal, apart, *rocks), (limit, near, on_the_ground))
     state = ParticleState(position, 0 * position, color=np.tile(SLOW, (agents, 1)), size=np.full(agents, TALL))
     camera = {"center": [8.0, 0.0, 1.0], "width": 34.0, "elevation": 9.0, "azimuth": 28.0}
