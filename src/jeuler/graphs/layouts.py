@@ -307,7 +307,10 @@ def columns_for(owned: np.ndarray) -> int:
 
 
 def near_order(edges: np.ndarray, particles: int) -> np.ndarray:
-    """The particles in an order that puts joined ones near each other (reverse Cuthill-McKee)."""
+    """The particles in an order that puts joined ones near each other.
+
+    Source: E. Cuthill, J. McKee, Reducing the bandwidth of sparse symmetric matrices, 1969; reversed, by SciPy.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jeuler._core.component import component
+from jeuler.graphs.layouts import near_order
 
 
 @component(static=("strips", "size", "hops"))
@@ -54,22 +55,9 @@ def partition(groups: tuple[Any, ...], particles: int, strips: int) -> Partition
     arrays = [np.asarray(one, np.int64) for one in groups]
     size = -(-particles // strips)
     as_given = np.arange(particles)
-    orders = [as_given] if strips == 1 or not arrays else [as_given, reverse_cuthill_mckee(arrays, particles)]
+    joined = [one[:, k : k + 2] for one in arrays for k in range(one.shape[1] - 1)]
+    orders = [as_given, near_order(np.concatenate(joined), particles)] if strips > 1 and joined else [as_given]
     return min((_cut(arrays, order, size, strips) for order in orders), key=Partition.sent)
-
-
-def reverse_cuthill_mckee(groups: list[np.ndarray], particles: int) -> np.ndarray:
-    """An order, (particle,), in which the particles of a group are near each other.
-
-    Source: E. Cuthill, J. McKee, Reducing the bandwidth of sparse symmetric matrices, 1969; by SciPy.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import reverse_cuthill_mckee as of_matrix
-
-    pairs = np.concatenate([one[:, k : k + 2] for one in groups for k in range(one.shape[1] - 1)])
-    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
-    joined = coo_array((np.ones(len(i), np.int8), (i, j)), (particles, particles))
-    return np.asarray(of_matrix(joined.tocsr(), symmetric_mode=True), np.int64)
 
 
 def _cut(groups: list[np.ndarray], order: np.ndarray, size: int, strips: int) -> Partition:
