@@ -139,6 +139,10 @@ def test_repr_says_shapes_also_while_tracing():
     assert "float64[2]" in seen[0][1]
 
 
+def test_repr_says_shapes_of_what_has_no_values():
+    assert repr(jax.eval_shape(lambda: jeuler.Lifetime(1.0))) == "Lifetime(duration=float64[])"
+
+
 def rows_of(page):
     return [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in re.findall(r"<tr>(.*?)</tr>", page)]
 

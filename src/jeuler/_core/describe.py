@@ -107,7 +107,7 @@ def table(title: str, rows: Iterable[Sequence[Any]], head: Sequence[str] = (), n
 
 def text_table(title: str, rows: Iterable[Sequence[Any]], head: Sequence[str] = (), note: str = "") -> str:
     """The same for a terminal: at most a screen, columns one below the other, the note at the top."""
-    lines = [[str(cell) for cell in row] for row in ([head] if head else [])] + [list(map(str, row)) for row in rows]
+    lines = [[str(cell) for cell in row] for row in (*([head] if head else []), *rows)]
     widths = [max(map(len, column)) for column in itertools.zip_longest(*lines, fillvalue="")]
     shown = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in lines]
     above = textwrap.wrap(f"{title}: {note}" if note else title, WIDTH, max_lines=5)
@@ -134,8 +134,8 @@ def _type_and_values(x: Any) -> tuple[str, str]:
 
 
 def values_of(x: Any) -> str:
-    """Up to three numbers as they are, or the range of more; nothing of an array that is being traced."""
-    if isinstance(x, jax.core.Tracer) or not x.size:
+    """Up to three numbers as they are, or the range of more; nothing of what is traced or has no values."""
+    if isinstance(x, (jax.core.Tracer, jax.ShapeDtypeStruct)) or not x.size:
         return ""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         return ""

@@ -13,7 +13,7 @@ import numpy as np
 from jeuler._core import checks, trees
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler._core.describe import table
+from jeuler._core.describe import table, text_table
 from jeuler._core.precision import flat
 from jeuler.accuracy.asked import Asked
 from jeuler.accuracy.candidates import (
@@ -110,10 +110,7 @@ class MethodAdvice:
         return self.rows[0] if self.rows and math.isfinite(self.rows[0].seconds) else None
 
     def __repr__(self) -> str:
-        rows = [HEAD, *map(_cells, self.rows)]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(HEAD) - 1)]
-        lines = ["  ".join([*map(str.ljust, row, widths), row[-1]]) for row in rows[:23]]
-        return "\n".join(line.rstrip() if len(line) <= 100 else f"{line[:97]}..." for line in [self.reason, *lines])
+        return text_table(self.reason, map(_cells, self.rows), HEAD)
 
     def to_markdown(self) -> str:
         """The ranking as a table, one line a method."""
