@@ -29,12 +29,13 @@ def double_precision() -> AbstractContextManager:
 
 def cast(x: PyTree, dtype: Any) -> PyTree:
     """x with its floating leaves as arrays of a real dtype, its complex ones in the same precision; beside float32
-    integers have 32 bits, as everywhere where float64 is off."""
+    integers have 32 bits, as everywhere where float64 is off, but where one needs more."""
 
     def leaf(v: Any) -> Any:
         kind = jnp.result_type(v)
         if jnp.issubdtype(kind, jnp.integer) and np.dtype(dtype) == np.float32 and np.dtype(kind).itemsize == 8:
-            return np.asarray(v).astype(np.int32 if jnp.issubdtype(kind, jnp.signedinteger) else np.uint32)
+            short = np.asarray(v).astype(np.int32 if jnp.issubdtype(kind, jnp.signedinteger) else np.uint32)
+            return short if np.array_equal(short, v) else v
         if not jnp.issubdtype(kind, jnp.inexact):
             return v
         to_complex = jnp.issubdtype(kind, jnp.complexfloating)
