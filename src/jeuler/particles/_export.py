@@ -10,7 +10,7 @@ import numpy as np
 
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
-from jeuler.particles.state import ParticleState
+from jeuler.particles.state import ParticleState, check_run, in_space
 from jeuler.solving.dataset import to_dataset
 
 
@@ -41,11 +41,7 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
       (3, 3, 2)
     """
     path = pathlib.Path(path)
-    if not isinstance(solution.y, ParticleState) or np.ndim(solution.y.position) != 3:
-        raise ValueError(
-            "export needs a solution whose .y is a ParticleState with leading axis saved; run simulate with save=None, "
-            "and take one member of a batch"
-        )
+    check_run("export", solution)
     writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk, ".ply": _write_ply, ".nc": _write_nc}
     if path.suffix not in writers:
         raise ValueError(f"export writes {', '.join(writers)}, got {path.name!r}; give the path one of these ends")
@@ -71,8 +67,7 @@ def _living(state: ParticleState, n: int) -> tuple[np.ndarray, np.ndarray, np.nd
     """Who lives at a saved time, and their positions and velocities, (living, 3)."""
     position, velocity = np.asarray(state.position[n]), np.asarray(state.velocity[n])
     here = np.ones(len(position), bool) if state.alive is None else np.asarray(state.alive[n])
-    empty = [(0, 0), (0, 3 - position.shape[1])]
-    return here, np.pad(position, empty)[here], np.pad(velocity, empty)[here]
+    return here, in_space(position[here]), in_space(velocity[here])
 
 
 def _write_xyz(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:

@@ -284,6 +284,20 @@ def zero_dead_slots(state: ParticleState) -> ParticleState:
     return replace(rest, position=position, velocity=velocity, mass=state.mass)
 
 
+def in_space(x: np.ndarray) -> np.ndarray:
+    """Points (..., dim) with 0 for the coordinates that they do not have: (..., 3)."""
+    return np.concatenate([x, np.zeros((*x.shape[:-1], 3 - x.shape[-1]), x.dtype)], axis=-1)
+
+
+def check_run(caller: str, solution: Any) -> None:
+    """An error in the words of ``caller`` unless the solution holds states with leading axis saved."""
+    if not isinstance(solution.y, ParticleState) or jnp.ndim(solution.y.position) != 3:
+        raise ValueError(
+            f"{caller} needs a solution whose .y is a ParticleState with leading axis saved; run simulate with "
+            f"save=None, and take one member of a batch"
+        )
+
+
 def split_state(state: ParticleState) -> tuple[tuple[Any, ...], ParticleState]:
     """A state as it is carried from step to step: the motion by components, and the rest."""
     motion = split(state.position), split(state.velocity)

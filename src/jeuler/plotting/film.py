@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 from jeuler._core.component import result
-from jeuler.particles.state import ParticleState
+from jeuler.particles.state import check_run
 from jeuler.plotting.camera import Camera, View, new_axes
 from jeuler.plotting.render import Look, Picture, alive_of
 
@@ -50,11 +50,7 @@ def animate(
       >>> film.frames
       4
     """
-    if not isinstance(solution.y, ParticleState) or np.ndim(solution.y.position) != 3:
-        raise ValueError(
-            "animate needs a solution whose .y is a ParticleState with leading axis saved; run simulate with "
-            "save=None, and take one member of a batch"
-        )
+    check_run("animate", solution)
     film = Film(solution, scene, fps, every, size, dpi, camera or Camera(), look or Look(), title, progress)
     if path is not None:
         film.save(path)

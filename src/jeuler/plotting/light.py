@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jeuler.plotting.models import frame_along
+
 
 def light_through(points: np.ndarray, weight: np.ndarray, toward: np.ndarray, cell: float) -> np.ndarray:
     """The share of the light that reaches each point (point, 3) past all others, (point,).
@@ -15,10 +17,7 @@ def light_through(points: np.ndarray, weight: np.ndarray, toward: np.ndarray, ce
 
     Source: T. Lokovic, E. Veach, Deep Shadow Maps, SIGGRAPH 2000; columns of cells stand for their pixels.
     """
-    across = np.cross(toward, [0.0, 0.0, 1.0] if abs(toward[2]) < 0.9 else [1.0, 0.0, 0.0])
-    across = across / np.linalg.norm(across)
-    frame = np.stack([across, np.cross(toward, across), -toward])
-    place = points @ frame.T / cell
+    place = points @ frame_along(-toward).T / cell
     place = place - place.min(axis=0) + 1
     shape = tuple(np.ceil(place.max(axis=0)).astype(int) + 3)
     low, share = np.floor(place).astype(int), place - np.floor(place)

@@ -64,6 +64,12 @@ def unit(x: np.ndarray) -> np.ndarray:
     return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
 
 
+def frame_along(way: np.ndarray) -> np.ndarray:
+    """Three unit vectors at right angles, the last one along the unit vector ``way``: (3, 3)."""
+    right = unit(np.cross([0.0, 0.0, 1.0] if abs(way[2]) < 0.9 else [0.0, 1.0, 0.0], way))
+    return np.stack([right, np.cross(way, right), way])
+
+
 def sky_directions(count: int = SKY) -> np.ndarray:
     """Unit vectors over the upper half, as many where the sky is high as it is bright there: (count, 3)."""
     k = np.arange(count) + 0.5

@@ -15,7 +15,7 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View
 from jeuler.plotting.light import light_through
-from jeuler.plotting.models import Model, Shadows, bake, copies, model, unit
+from jeuler.plotting.models import Model, Shadows, bake, copies, frame_along, model, unit
 from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, springs_of
 from jeuler.plotting.surfaces import ball, fine_mesh_of
 
@@ -156,8 +156,7 @@ class Studio:
         plotter.show(auto_close=False)
 
         def seen_from(way: np.ndarray) -> Shadows:
-            right = unit(np.cross([0.0, 0.0, 1.0] if abs(way[2]) < 0.9 else [0.0, 1.0, 0.0], way))
-            frame = np.stack([right, np.cross(way, right), way])
+            frame = frame_along(way)
             if not len(points):
                 return Shadows(frame, np.zeros(2), 1.0, np.full((1, 1), -np.inf))
             low, high = (points @ frame.T).min(axis=0), (points @ frame.T).max(axis=0)
@@ -204,7 +203,7 @@ class Studio:
         shape = shapes[self.look.particles]()
         size = np.full(len(self.index), 0.02 * self.reach) if self.size is None else self.size[self.index]
         level = [1, 1, 0] if self.look.particles == "runners" else [1, 1, 1]
-        way = None if shape.shine == 0.3 else self.velocity[self.index] * level + [1e-9, 0, 0]
+        way = None if self.look.particles is True else self.velocity[self.index] * level + [1e-9, 0, 0]
         return [copies(shape, self.position[self.index], size, self.rgba[self.index], way)]
 
     def _curves(self) -> list[tuple[np.ndarray, np.ndarray, float]]:

@@ -37,11 +37,7 @@ def mesh_of(
         half = np.broadcast_to(np.asarray(collider.half_size), 3)
         return block(middle(collider, t), half, cells // 2 if cells > 60 else 1)
     x, y, z = upper_side(collider, t, center, half, cells)
-    there = np.isfinite(z)
-    triangles = grid_triangles(z.shape)
-    triangles = triangles[there.ravel()[triangles].all(axis=1)]
-    number = np.cumsum(there) - 1
-    return np.stack([x, y, z], axis=-1)[there], number[triangles]
+    return heights_as_mesh(x, y, z)
 
 
 def fine_mesh_of(collider: Any, t: float, center: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
@@ -58,10 +54,7 @@ def fine_mesh_of(collider: Any, t: float, center: np.ndarray, half: np.ndarray) 
         z = point[2] - ((x - point[0]) * normal[0] + (y - point[1]) * normal[1]) / normal[2]
     else:
         z = highest_zero(collider, t, x, y, center[2] - 2 * wide, center[2] + 2 * wide)
-    there = np.isfinite(z)
-    triangles = grid_triangles(z.shape)
-    triangles = triangles[there.ravel()[triangles].all(axis=1)]
-    return np.stack([x, y, np.nan_to_num(z)], axis=-1).reshape(-1, 3), triangles, True
+    return *heights_as_mesh(x, y, z), True
 
 
 def highest_zero(collider: Any, t: float, x: np.ndarray, y: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -96,6 +89,14 @@ def grid_triangles(shape: tuple[int, ...]) -> np.ndarray:
     g = np.arange(shape[0] * shape[1]).reshape(shape)
     a, b, c, d = (part.ravel() for part in (g[:-1, :-1], g[1:, :-1], g[1:, 1:], g[:-1, 1:]))
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def heights_as_mesh(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (point, 3) and triangles (face, 3) of heights over a grid, without those that are not finite."""
+    there = np.isfinite(z)
+    triangles = grid_triangles(z.shape)
+    number = np.cumsum(there) - 1
+    return np.stack([x, y, z], axis=-1)[there], number[triangles[there.ravel()[triangles].all(axis=1)]]
 
 
 def upper_side(

@@ -14,7 +14,7 @@ from matplotlib import colors
 from jeuler._core import checks
 from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
-from jeuler.particles.state import ParticleState
+from jeuler.particles.state import ParticleState, check_run, in_space
 from jeuler.plotting.camera import Camera, View
 from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, springs_of
 from jeuler.plotting.solids import FILL
@@ -52,11 +52,7 @@ def view(
       >>> view(jeuler.simulate(jeuler.Scene(), state, dt=0.1, num_steps=3))
       TurnableView(4 frames, 1 particles, to t = 0.3 s)
     """
-    if not isinstance(solution.y, ParticleState) or np.ndim(solution.y.position) != 3:
-        raise ValueError(
-            "view needs a solution whose .y is a ParticleState with leading axis saved; run simulate with save=None, "
-            "and take one member of a batch"
-        )
+    check_run("view", solution)
     if every is None:
         every = -(-len(solution.t) // MOST_FRAMES)
     every = checks.count("every", every, least=1)
@@ -179,11 +175,6 @@ def _library() -> Any:
     except ImportError:
         raise RuntimeError("view needs the library k3d, which is not installed; pip install 'jeuler[view]'") from None
     return k3d
-
-
-def in_space(x: np.ndarray) -> np.ndarray:
-    """Points (..., dim) with 0 for the coordinates that they do not have: (..., 3)."""
-    return np.concatenate([x, np.zeros((*x.shape[:-1], 3 - x.shape[-1]), x.dtype)], axis=-1)
 
 
 def packed(rgb: Any) -> np.ndarray:
