@@ -3,11 +3,15 @@
 python benchmarks/ensembles.py million [MEMBERS]
 python benchmarks/ensembles.py devices [MEMBERS]       on 1, 2, 4 and 8 devices of one machine
 python benchmarks/ensembles.py processes [MEMBERS]     two processes by jax.distributed on loopback, beside one
-python benchmarks/ensembles.py killed [MEMBERS]        the same, one killed at work; how and when the other ends
+python benchmarks/ensembles.py killed [MEMBERS]        the same, one killed at work: when the other ends, what it
+                                                       says; both started again, beside a run in one go
+python benchmarks/ensembles.py kills [TIMES]           one process, kill -9 at so many random moments, then gone on
 """
 
 import json
 import os
+import pathlib
+import random
 import resource
 import socket
 import subprocess
@@ -69,41 +73,75 @@ def million(count=1_000_000):
     )
 
 
-def two_children(count, **how):
+def two_children(count, *folder, **how):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    return [subprocess.Popen([sys.executable, __file__, "child", str(n), address, str(count)], **how) for n in range(2)]
+    children = [[sys.executable, __file__, "child", str(n), address, str(count), *folder] for n in range(2)]
+    return [subprocess.Popen(child, stdout=subprocess.PIPE, **how) for child in children]
 
 
-def killed(count=100_000_000):
-    """kill -9 of one of two processes at work: the other ends, and says why."""
+def answers_of(children):
+    return [json.loads(child.communicate()[0].splitlines()[-1]) for child in children]
+
+
+def members_kept(folder):
+    state = pathlib.Path(folder, "state.npz")
+    if not state.exists():
+        return 0
+    with np.load(state) as file:
+        return json.loads(str(file["about"]))["steps"]
+
+
+def killed(count=30_000_000):
+    """kill -9 of one of two processes at work: the other ends, and says why; both go on when they are started again."""
+    in_one_go = answers_of(two_children(count))[0]
     for victim in (1, 0):
-        with tempfile.TemporaryFile("w+") as words:
-            children = two_children(count, stdout=subprocess.PIPE, stderr=words)
-            for child in children:
-                child.stdout.readline()  # it has begun
+        with tempfile.TemporaryDirectory() as folder, open(f"{folder}/words", "w+") as words:
+            children = two_children(count, f"{folder}/run", stderr=words)
+            while not pathlib.Path(folder, "run", "state.npz").exists():
+                time.sleep(0.1)
             time.sleep(3)
             children[victim].kill()
-            start = time.perf_counter()
-            try:
-                code = children[1 - victim].wait(timeout=60)
-                print(
-                    f"process {victim} killed: the other ended after {time.perf_counter() - start:.0f} s, code {code}"
-                )
-            except subprocess.TimeoutExpired:
-                print(f"process {victim} killed: the other was still there after 60 s")
-            finally:
-                for child in children:
-                    child.kill()
-                    child.wait()
+            start, told = time.perf_counter(), None
+            while children[1 - victim].poll() is None and time.perf_counter() < start + 60:
+                time.sleep(0.1)
+                if told is None and "a process of the ensemble has ended" in pathlib.Path(folder, "words").read_text():
+                    told = time.perf_counter() - start
+            print(
+                f"process {victim} killed: the other said so after {told or np.nan:.1f} s and ended after "
+                f"{time.perf_counter() - start:.1f} s with code {children[1 - victim].poll()}"
+            )
+            for child in children:
+                child.kill()
+                child.wait()
             words.seek(0)
-            print(*[line for line in words.read().splitlines() if "rror" in line or "heartbeat" in line][:3], sep="\n")
+            said = [line for line in words.read().splitlines() if "Error" in line or "heartbeat" in line]
+            print(*[line[:300] for line in said], sep="\n")
+            print(f"{members_kept(f'{folder}/run'):,} of {count:,} members are kept")
+            answers = answers_of(two_children(count, f"{folder}/run"))
+            print("gone on, equal to a run in one go to the bit:", answers == [in_one_go, in_one_go])
+
+
+def kills(times=20):
+    count, rng, same, killed, kept = 10_000_000, random.Random(0), 0, 0, []
+    expected = list(with_ensemble(drawn(count), batch=BATCH))
+    for _ in range(times):
+        with tempfile.TemporaryDirectory() as folder:
+            child = subprocess.Popen([sys.executable, __file__, "alone", str(count), folder], stdout=subprocess.PIPE)
+            child.stdout.readline()
+            time.sleep(rng.uniform(0, 5))
+            killed += child.poll() is None
+            child.kill()
+            child.wait()
+            kept.append(members_kept(folder))
+            how = {"resume": folder, "checkpoint_every": 10 * BATCH}
+            same += list(with_ensemble(drawn(count), batch=BATCH, **how)) == expected
+    print(f"{killed} of {times} killed, {min(kept):,} to {max(kept):,} of {count:,} members done: {same} bit-identical")
 
 
 def processes(count=100_000):
-    children = two_children(count, stdout=subprocess.PIPE)
-    answers = [json.loads(child.communicate()[0].splitlines()[-1]) for child in children]
+    answers = answers_of(two_children(count))
     print("two processes", answers[0])
     print("the same in both", answers[0] == answers[1])
     print("one process  ", with_ensemble(drawn(count), batch=BATCH))
@@ -128,23 +166,31 @@ def on_devices(count):
     print(f"{mesh.size} devices {min(seconds[1:]):.2f} s, first call {seconds[0]:.2f} s")
 
 
-def child(number, address, count):
+def alone(count, folder):
+    members = drawn(int(count))
+    print("begun", flush=True)
+    with_ensemble(members, batch=BATCH, resume=folder, checkpoint_every=10 * BATCH)
+
+
+def child(number, address, count, folder=None):
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(address, num_processes=2, process_id=int(number), heartbeat_timeout_seconds=20)
     mesh = jax.make_mesh((jax.device_count(),), ("member",))
+    members = drawn(int(count))
     print("begun", flush=True)
-    print(json.dumps(with_ensemble(drawn(int(count)), mesh=mesh, batch=BATCH)))
+    print(json.dumps(with_ensemble(members, mesh=mesh, batch=BATCH, resume=folder)))
 
 
 if __name__ == "__main__":
     task, *rest = sys.argv[1:]
-    if task == "child":
-        child(*rest)
+    if task in ("child", "alone"):
+        {"child": child, "alone": alone}[task](*rest)
     else:
         tasks = {
             "million": million,
             "processes": processes,
             "killed": killed,
+            "kills": kills,
             "devices": devices,
             "on_devices": on_devices,
         }

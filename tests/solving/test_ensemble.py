@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray
 
 import jeuler
 
@@ -86,6 +87,63 @@ def test_keys_are_members():
     np.testing.assert_array_equal(found.results, jax.vmap(jax.random.normal)(keys))
 
 
+class Killed(BaseException):
+    """Nothing is done at the end, as after kill -9."""
+
+
+BOTH = {"moments": jeuler.Moments(), "quantiles": jeuler.Quantiles((0.1, 0.5))}
+
+
+def numbers(found):
+    return jax.tree.leaves((found.results, [vars(value) for value in (found.reduced or {}).values()]))
+
+
+@pytest.mark.parametrize("mesh", [None, "one device"])
+@pytest.mark.parametrize("reduce", [None, BOTH])
+@pytest.mark.parametrize("stop", [Killed, KeyboardInterrupt])
+def test_an_ensemble_goes_on_from_its_folder_with_the_numbers_of_one_in_one_go(tmp_path, mesh, reduce, stop):
+    how = {"reduce": reduce, "batch": 100, "mesh": mesh and jax.make_mesh((1,), ("member",))}
+    told = []
+
+    def until(last):
+        def progress(n, of):
+            told.append(n)
+            if n == last:
+                raise stop
+
+        return progress
+
+    whole = jeuler.ensemble(trajectory, MEMBERS, **how)
+    how |= {"resume": tmp_path / "run", "checkpoint_every": 200}
+    for last in (100, 700):
+        with pytest.raises(stop):
+            jeuler.ensemble(trajectory, MEMBERS, progress=until(last), **how)
+    found = jeuler.ensemble(trajectory, MEMBERS, progress=until(None), **how)
+    first, again = (1, 7) if stop is Killed else (2, 8)  # the first batch that was not kept
+    begun = [1, *range(first, 8), *range(again, 11)]
+    assert told == [min(100 * n, 1003) for n in (*begun, 11)]
+    told.clear()
+    for one in (found, jeuler.ensemble(trajectory, MEMBERS, progress=until(None), **how)):
+        assert one.lost.tolist() == [5, 1002]
+        for a, b in zip(numbers(one), numbers(whole), strict=True):
+            np.testing.assert_array_equal(np.asarray(a), b)
+    assert not told  # a finished one does nothing
+    other = {"reduce": jeuler.Moments()}, {"batch": 200}, {"mesh": None, "reduce": jeuler.Quantiles(bins=3)}
+    for change in other:
+        with pytest.raises(ValueError, match="holds another run: another function, members, reducer, batch"):
+            jeuler.ensemble(trajectory, MEMBERS, **how | change)
+    with pytest.raises(ValueError, match="holds another run"):
+        jeuler.ensemble(trajectory, MEMBERS | {"ks": MEMBERS["ks"] + 1e-9}, **how)
+
+
+def test_results_on_disk_can_be_indexed(tmp_path):
+    found = jeuler.ensemble(lambda x: {"twice": 2 * x, "sum": x.sum()}, np.ones((5, 2)), batch=2, resume=tmp_path)
+    assert found.results["twice"][4].tolist() == [2.0, 2.0]
+    assert np.asarray(found.results["sum"]).tolist() == [2.0] * 5
+    members = xarray.open_zarr(tmp_path / "results.zarr", consolidated=False)
+    assert members.twice.dims == ("member", "twice_0")
+
+
 def test_wrong_arguments_are_told():
     for wrong, match in (
         (lambda: jeuler.ensemble(trajectory, {"a": np.ones(3), "b": np.ones(4)}), "one leading axis"),
@@ -93,6 +151,8 @@ def test_wrong_arguments_are_told():
         (lambda: jeuler.ensemble(trajectory, np.ones(3), reduce=3), "start, add, merge and value"),
         (lambda: jeuler.ensemble(3, np.ones(3)), "run must be a function"),
         (lambda: jeuler.ensemble(lambda x: x, np.ones(3), batch=0), "batch must be at least 1"),
+        (lambda: jeuler.ensemble(lambda x: x, np.ones(3), resume=3), "resume must be the path of a folder"),
+        (lambda: jeuler.ensemble(lambda x: x, np.ones(3), checkpoint_every=3), "checkpoint_every needs resume"),
         (lambda: jeuler.Quantiles((1.5,)), "from 0 to 1"),
         (lambda: jeuler.Quantiles(bounds=(1.0, 0.0)), "Quantiles.bounds"),
     ):

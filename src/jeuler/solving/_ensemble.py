@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -17,6 +19,9 @@ from jeuler._core.component import Function, result
 from jeuler._jax import programs
 from jeuler.solving._scan import Solution
 from jeuler.solving.chunks import Progress, _telling, check_progress
+from jeuler.solving.kept_members import MEMBERS, KeptMembers, in_touch
+from jeuler.solving.long_runs import check_resume, fingerprint
+from jeuler.solving.store import Store
 
 PyTree = Any
 MEMORY = 2**26  # bytes of the results of a batch, where the user does not say how large,
@@ -28,7 +33,8 @@ class Ensemble:
     """What became of the members.
 
     Attributes:
-      results: what the run gave, each leaf with a leading axis (member, ...); None where it was reduced.
+      results: what the run gave, each leaf with a leading axis (member, ...); None where it was reduced. With
+        ``resume`` a leaf is read from disk where it is indexed or converted.
       reduced: what ``reduce`` made of the results of the members that were not lost; None without it.
       lost: the numbers of the members that were lost, (lost,), rising: their results hold a number that is not finite.
       count: how many members there were.
@@ -54,6 +60,8 @@ def ensemble(
     mesh: Any = None,
     reduce: Any = None,
     progress: Progress = None,
+    resume: Any = None,
+    checkpoint_every: int | None = None,
 ) -> Ensemble:
     """Run each member, batch after batch, and keep the results or what a reducer makes of them.
 
@@ -70,8 +78,13 @@ def ensemble(
       reduce: a reducer such as `Moments` or `Quantiles`, or a dictionary of them, so that the results need not be
         stored. An object of your own with their four methods does too.
       progress: True shows a bar; a function is called as ``progress(member, members)`` after each batch.
+      resume: path of a folder that keeps what the reducers have behind them, or the results, and from which the same
+        call goes on after a kill, with the numbers of a run in one go, to the bit. Of several processes the first one
+        writes; all are started again. Results that are not reduced need zarr, ``pip install 'jeuler[runs]'``.
+      checkpoint_every: members between two states on disk, at the end of a batch; None for one about each 10 s.
     Returns: `Ensemble`.
-    Raises: ValueError, before tracing, if the members have no common leading axis, or a batch does not fit the mesh.
+    Raises: ValueError, before tracing, if the members have no common leading axis, a batch does not fit the mesh, or
+      the folder holds something else; RuntimeError, if another process has ended.
     Example:
       >>> import jax, jax.numpy as jnp, jeuler
       >>> def end(ks):
@@ -85,6 +98,7 @@ def ensemble(
     checks.function("run", run, "(member) -> results", "write run=lambda member: jeuler.solve(...).y, say")
     count = _number_of(members)
     check_progress(progress, None)
+    check_resume(resume, checkpoint_every, None, frames=reduce is None)
     if programs.is_transformed():
         raise ValueError(
             "ensemble works outside of jit, vmap and grad, got a call inside; write jax.vmap(run)(members)"
@@ -94,14 +108,15 @@ def ensemble(
         if not all(hasattr(one, method) for method in ("start", "add", "merge", "value")):
             raise ValueError(f"reduce must have start, add, merge and value, got {checks.shown(one)} {name}".rstrip())
     size = _size_of_batch(run, members, count, batch, mesh)
-    work = _Work(run, tuple(reducers.items()), mesh, size)
-    with _telling(progress, count) as tell:
-        for first in range(0, count, size):
-            some = slice(first, first + size)
-            work.batch(jax.tree.map(operator.itemgetter(some), members), min(size, count - first))
+    work = _Work(run, tuple(reducers.items()), mesh, size, count)
+    if resume is not None:
+        work.keep_in(resume, members, checkpoint_every)
+    with _telling(progress, count) as tell, work.kept_at_the_end():
+        for first in range(work.done, count, size):
+            work.batch(jax.tree.map(operator.itemgetter(slice(first, first + size)), members))
             if tell:
-                tell(min(first + size, count))
-    results, states, lost = work.end(count)
+                tell(work.done)
+    results, states, lost = work.end()
     values = {name: one.value(states[name]) for name, one in reducers.items()}
     reduced = None if reduce is None else values if isinstance(reduce, dict) else values[""]
     return Ensemble(results, reduced, np.flatnonzero(lost), count)
@@ -132,16 +147,40 @@ def _size_of_batch(run: Callable, members: PyTree, count: int, batch: int | None
 class _Work:
     """The batches of one call."""
 
-    def __init__(self, run: Callable, reducers: tuple, mesh: Any, size: int) -> None:
-        self.mesh, self.size, self.reducers = mesh, size, reducers
+    def __init__(self, run: Callable, reducers: tuple, mesh: Any, size: int, count: int) -> None:
+        self.run, self.mesh, self.size, self.reducers, self.count = run, mesh, size, reducers, count
         self.axes: Any = None if mesh is None else PartitionSpec(mesh.axis_names)
         self.begin = programs.prepared(_first_states, (Function(run),), (reducers,))
         self.step = programs.prepared(_next, (Function(run),), (reducers, mesh))
+        self.done: int = 0
         self.states: PyTree = None
         self.results: list[PyTree] = []
         self.lost: list[Any] = []
+        self.kept: KeptMembers | None = None
 
-    def batch(self, members: PyTree, count: int) -> None:
+    def keep_in(self, resume: Any, members: PyTree, every: int | None) -> None:
+        """Keep the work in this folder, and go on from what is there."""
+        batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.size, *np.shape(x)[1:]), x.dtype), members)
+        real = jax.ShapeDtypeStruct((self.size,), np.bool_)
+        states = jax.eval_shape(functools.partial(_first_states, Function(self.run), self.reducers, {}), batch, real)
+        # on one device, so that it does not matter which of several processes has which
+        lowered, dynamic = programs.lowered(_next, (Function(self.run),), (self.reducers, None), states, batch, real)
+        devices = 1 if self.mesh is None else self.mesh.size
+        store = Store(resume, fingerprint(lowered, [*dynamic, *jax.tree.leaves(members), devices]), MEMBERS)
+        if self.mesh is not None:
+            states = jax.tree.map(lambda x: jax.ShapeDtypeStruct((devices, *x.shape), x.dtype), states)
+        like = states, jax.ShapeDtypeStruct((self.count,), np.bool_)
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batch)
+        result = None if self.reducers else jax.eval_shape(self.run, one)
+        self.kept = KeptMembers(store, like, result, self.count, self.size, every)
+        if self.kept.state is not None:
+            self.states, lost = self.kept.state
+            self.states = jax.tree.map(jnp.asarray if self.mesh is None else self._placed, self.states)
+            self.done = self.kept.done
+            self.lost = [lost[: self.done]]
+
+    def batch(self, members: PyTree) -> None:
+        count = min(self.size, self.count - self.done)
         members = jax.tree.map(self._padded, members)
         real = np.arange(self.size) < count
         if self.states is None:
@@ -151,7 +190,31 @@ class _Work:
         self.lost.append(lost)
         if not self.reducers:
             # on the host, so that the memory of the device holds one batch
-            self.results.append(jax.tree.map(np.asarray, results) if jax.process_count() == 1 else results)
+            if self.kept:
+                self.kept.write(self.done, self._whole(results), count)
+            else:
+                self.results.append(jax.tree.map(np.asarray, results) if jax.process_count() == 1 else results)
+        self.done += count
+        if self.kept and (self.done >= self.kept.due or self.done == self.count):
+            self._keep(self.kept)
+
+    def _keep(self, kept: KeptMembers) -> None:
+        lost = np.zeros(self.count, bool)
+        lost[: self.done] = self._lost()
+        self.lost = [lost[: self.done]]
+        kept.keep((self._whole(self.states), lost), self.done)
+
+    @contextlib.contextmanager
+    def kept_at_the_end(self) -> Iterator[None]:
+        """What is done is kept also where Ctrl-C or the bar ends it, unless that was amid a batch."""
+        try:
+            yield
+        except (Exception, KeyboardInterrupt) as error:
+            usable = not any(getattr(x, "is_deleted", bool)() for x in jax.tree.leaves(self.states))
+            alone = jax.process_count() == 1 and not isinstance(error, OSError)
+            if self.kept and alone and usable and self.done > self.kept.done:
+                self._keep(self.kept)
+            raise
 
     def _padded(self, x: Any) -> Any:
         missing = self.size - len(x)
@@ -172,28 +235,38 @@ class _Work:
     def _on_each_device(self, x: Any) -> Any:
         return self._placed(np.broadcast_to(np.asarray(x), (self.mesh.size, *x.shape)))
 
-    def end(self, count: int) -> tuple[PyTree, dict[str, PyTree], np.ndarray]:
+    def end(self) -> tuple[PyTree, dict[str, PyTree], np.ndarray]:
         """All results, the states of the reducers, and which members were lost."""
-        lost = np.concatenate([self._whole(x) for x in self.lost])[:count]
+        lost = self._lost()
         results = None
-        if not self.reducers:
-            pieces = [jax.tree.map(self._whole, piece) for piece in self.results]
-            results = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
+        if self.kept:
+            results = self.kept.results()
+        elif not self.reducers:
+            pieces = [self._whole(piece) for piece in self.results]
+            results = jax.tree.map(lambda *parts: np.concatenate(parts)[: self.count], *pieces)
         states = self.states
         if self.mesh is not None:
-            states = jax.tree.map(self._whole, states)
+            states = self._whole(states)
             parts = [jax.tree.map(lambda x, n=n: jnp.asarray(x[n]), states) for n in range(self.mesh.size)]
             states = parts[0]
             for part in parts[1:]:
                 states = {name: one.merge(states[name], part[name]) for name, one in self.reducers}
         return results, states, lost
 
-    def _whole(self, x: Any) -> np.ndarray:
+    def _lost(self) -> np.ndarray:
+        return np.concatenate([self._whole(x) for x in self.lost])[: self.done]
+
+    def _whole(self, tree: PyTree) -> PyTree:
+        """The arrays with what all processes have of them."""
         if self.mesh is None or jax.process_count() == 1:
-            return np.asarray(x)
+            return jax.tree.map(np.asarray, tree)
         from jax.experimental import multihost_utils
 
-        return np.asarray(multihost_utils.process_allgather(x, tiled=True))
+        def whole(x):
+            return x if isinstance(x, np.ndarray) else np.asarray(multihost_utils.process_allgather(x, tiled=True))
+
+        with self.kept.in_touch() if self.kept else in_touch("begin anew, and give resume= to keep what is done"):
+            return jax.tree.map(whole, tree)
 
 
 def _batch(run: Function, members: PyTree, real: Any) -> tuple[PyTree, Any]:

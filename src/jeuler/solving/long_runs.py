@@ -17,7 +17,7 @@ from jeuler._jax import programs
 from jeuler.solving.chunks import EPOCH, FEWEST, Progress, Sizes, _begin, _chunk, _telling
 from jeuler.solving.grid import COUNTER, Grid
 from jeuler.solving.loop import Loop
-from jeuler.solving.store import Store
+from jeuler.solving.store import Store, names
 
 PyTree = Any
 BUFFER = 2**22  # bytes of frames that wait for the disk,
@@ -25,8 +25,8 @@ MOST_ROWS = 4096  # as many at most
 SECONDS = 10.0  # between two states on disk, where the user does not say
 
 
-def check_resume(resume: Any, checkpoint_every: Any, checkpoint: Any) -> None:
-    """One ValueError if the run cannot be kept on disk."""
+def check_resume(resume: Any, checkpoint_every: Any, checkpoint: Any, frames: bool = True) -> None:
+    """One ValueError if the run cannot be kept on disk, with frames or without."""
     if resume is None:
         if checkpoint_every is not None:
             raise ValueError('checkpoint_every needs resume, a folder to keep the state in; write resume="run"')
@@ -40,7 +40,8 @@ def check_resume(resume: Any, checkpoint_every: Any, checkpoint: Any) -> None:
     if checkpoint == "reversible":
         raise ValueError('resume must be None with checkpoint="reversible", a run in one piece; leave one out')
     try:
-        import zarr  # noqa: F401
+        if frames:
+            import zarr  # noqa: F401
     except ImportError:
         raise ValueError("resume writes frames with zarr, which is not installed; pip install 'jeuler[runs]'") from None
 
@@ -64,7 +65,7 @@ def run_on_disk(
     inputs = tuple(buffered if x is grid else x for x in inputs)
     state = programs.prepared(_begin, inputs, (*settings, loop_of))()
     lowered, dynamic = programs.lowered(_chunk, inputs, (*settings, loop_of), state, np.int32(0), grid.t0)
-    store = Store(resume, _fingerprint(lowered, dynamic))
+    store = Store(resume, fingerprint(lowered, dynamic))
     return Run(store, lowered.compile(), dynamic, grid, state, rows).to_end(checkpoint_every, progress)
 
 
@@ -73,7 +74,7 @@ def _frame(loop_of: Callable[..., Loop], inputs: tuple, settings: tuple, short: 
     return loop.saved(loop.first_carry())
 
 
-def _fingerprint(lowered: Any, dynamic: list) -> str:
+def fingerprint(lowered: Any, dynamic: list) -> str:
     """What program it is, with which numbers."""
     digest = hashlib.sha256(lowered.as_text().encode())
     for x in dynamic:
@@ -121,7 +122,8 @@ class Run:
                 f"num_steps must be at least {self.done:,}, the steps that the run in {self.store.path} has behind it, "
                 f"got {total:,}; read its frames, or give another path"
             )
-        self.store.open(self.frame, self.rows, total // grid.save_every + 1)
+        labels = names(self.frame[1], ("t",))
+        self.store.open(self.frame, labels, self.rows, total // grid.save_every + 1)
         numbers = max(FEWEST, sum(np.size(x) for x in jax.tree.leaves(self.state)))
         sizes = Sizes({}, numbers)
         kept_at = time.perf_counter()

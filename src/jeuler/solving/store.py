@@ -3,6 +3,8 @@
     path/frames.zarr      t and each part of what is saved, (frame, ...); NaN in frames that are still to come
     path/state.npz        what the next step starts from, and what run it is
 
+An ensemble likewise: its results in ``results.zarr``, (member, ...), and what its reducers have behind them.
+
 Zarr and not HDF5: a chunk is a file of its own that is replaced as a whole, so that a process that is killed leaves
 nothing half written, and another process can read while the run goes on.
 """
@@ -10,6 +12,7 @@ nothing half written, and another process can read while the run goes on.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import os
 import pathlib
@@ -23,7 +26,25 @@ import jax.numpy as jnp
 import numpy as np
 
 PyTree = Any
-STATE, FRAMES, VERSION = "state.npz", "frames.zarr", 1
+STATE, VERSION = "state.npz", 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """What a folder keeps, in the words of its files and messages."""
+
+    file: str
+    row: str
+    counted: str
+    depends_on: str
+
+
+RUN = Kind(
+    file="frames.zarr",
+    row="frame",
+    counted="steps",
+    depends_on="scene or field, start, dt, t0, key, step, save, save_every",
+)
 
 
 class StoredArray:
@@ -62,10 +83,10 @@ class StoredArray:
 class Store:
     """The folder of one run."""
 
-    def __init__(self, path: Any, fingerprint: str) -> None:
-        self.path, self.fingerprint = pathlib.Path(os.fspath(path)), fingerprint
+    def __init__(self, path: Any, fingerprint: str, kind: Kind = RUN) -> None:
+        self.path, self.fingerprint, self.kind = pathlib.Path(os.fsdecode(path)), fingerprint, kind
         self.arrays: list[Any] = []
-        self.kept: int = -1  # steps that the state on disk has behind it; -1 where there is none
+        self.kept: int = -1  # steps, or members, that the state on disk has behind it; -1 where there is none
 
     def last(self, like: PyTree) -> tuple[PyTree, dict[str, int]] | None:
         """The state that was written last, of this form, and its numbers; None where the run is to begin."""
@@ -74,7 +95,7 @@ class Store:
         if not self.path.is_dir():
             raise ValueError(f"resume={str(self.path)!r} is a file; give the path of a folder, which is made")
         if not (self.path / STATE).exists():
-            others = [x.name for x in self.path.iterdir() if x.name != FRAMES and not x.name.startswith(STATE)]
+            others = [x.name for x in self.path.iterdir() if x.name != self.kind.file and not x.name.startswith(STATE)]
             if others:
                 raise ValueError(
                     f"resume={str(self.path)!r} is a folder of something else, it holds {sorted(others)[0]!r}; "
@@ -87,37 +108,37 @@ class Store:
                 leaves = [file[f"leaf{n}"] for n in range(about["leaves"])]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(
-                f"{self.path / STATE} cannot be read ({error}); its frames are in {self.path / FRAMES}; move the "
-                f"folder away to begin anew"
+                f"{self.path / STATE} cannot be read ({error}); its {self.kind.row}s are in "
+                f"{self.path / self.kind.file}; move the folder away to begin anew"
             ) from error
         forms = [(x.shape, x.dtype) for x in jax.tree.leaves(like)]
         if about.get("fingerprint") != self.fingerprint or [(x.shape, x.dtype) for x in leaves] != forms:
             raise ValueError(
-                f"resume={str(self.path)!r} holds another run: another scene or field, start, dt, t0, key, step, save, "
-                f"save_every or version of JAX; give another path"
+                f"resume={str(self.path)!r} holds another run: another {self.kind.depends_on} or version of JAX; "
+                f"give another path"
             )
         self.kept = about["steps"]
         return jax.tree.unflatten(jax.tree.structure(like), leaves), about
 
-    def open(self, frame: PyTree, rows: int, frames: int) -> None:
-        """The arrays on disk for frames of this form, as many, made where they are not there; ``rows`` in a chunk."""
+    def open(self, frame: PyTree, labels: Sequence[str], rows: int, frames: int) -> None:
+        """The arrays on disk for frames of this form, with a name each, as many, made where they are not there;
+        ``rows`` in a chunk."""
         import zarr
 
+        place = self.path / self.kind.file
         with self.errors():
             self.path.mkdir(parents=True, exist_ok=True)
             if self.kept >= 0:
                 try:
-                    group = zarr.open_group(self.path / FRAMES, mode="r+")
-                    self.arrays = [group[name] for name in names(frame)]
+                    group = zarr.open_group(place, mode="r+")
+                    self.arrays = [group[name] for name in labels]
                 except (KeyError, FileNotFoundError, ValueError) as error:
-                    raise ValueError(
-                        f"{self.path / FRAMES} cannot be read ({error}); move the folder away to begin anew"
-                    ) from None
+                    raise ValueError(f"{place} cannot be read ({error}); move the folder away to begin anew") from None
                 for array in self.arrays:
                     if array.shape[0] < frames:
                         array.resize((frames, *array.shape[1:]))
                 return
-            group = zarr.open_group(self.path / FRAMES, mode="w")
+            group = zarr.open_group(place, mode="w")
             self.arrays = [
                 group.create_array(
                     name,
@@ -125,9 +146,9 @@ class Store:
                     chunks=(rows, *(max(1, size) for size in x.shape)),
                     dtype=x.dtype,
                     fill_value=np.nan if np.issubdtype(x.dtype, np.inexact) else 0,
-                    dimension_names=("frame", *(f"{name}_{n}" for n in range(len(x.shape)))),
+                    dimension_names=(self.kind.row, *(f"{name}_{n}" for n in range(len(x.shape)))),
                 )
-                for name, x in zip(names(frame), jax.tree.leaves(frame), strict=True)
+                for name, x in zip(labels, jax.tree.leaves(frame), strict=True)
             ]
 
     def write(self, place: int, frames: PyTree, count: int) -> None:
@@ -142,6 +163,7 @@ class Store:
         about = {"version": VERSION, "fingerprint": self.fingerprint, "leaves": len(leaves), "steps": steps, **numbers}
         part = self.path / f"{STATE}.part"
         with self.errors():
+            self.path.mkdir(parents=True, exist_ok=True)
             try:
                 with open(part, "wb") as file:
                     np.savez(file, about=json.dumps(about), **leaves)
@@ -164,16 +186,18 @@ class Store:
             yield
         except OSError as error:
             kept = (
-                f"the state after {self.kept:,} steps is kept there" if self.kept >= 0 else "no state is kept there yet"
+                f"the state after {self.kept:,} {self.kind.counted} is kept there"
+                if self.kept >= 0
+                else "no state is kept there yet"
             )
             message = f"{self.path} cannot be written ({error.strerror or error}); {kept}; make place and call it again"
             raise OSError(error.errno, message) from error
 
 
-def names(frame: PyTree) -> Sequence[str]:
-    """The names of the arrays of a frame: the time, and the paths of its parts."""
-    found: list[str] = []
-    for path, _ in jax.tree_util.tree_leaves_with_path(frame[1]):
+def names(tree: PyTree, first: tuple[str, ...] = ()) -> list[str]:
+    """The names of the arrays of a frame, after these first ones: the paths of its parts."""
+    found = list(first)
+    for path, _ in jax.tree_util.tree_leaves_with_path(tree):
         name = re.sub(r"\W+", "_", jax.tree_util.keystr(path)).strip("_") or "y"
-        found.append(name if name not in ("t", *found) else f"{name}_{len(found)}")
-    return ["t", *found]
+        found.append(name if name not in found else f"{name}_{len(found)}")
+    return found
