@@ -186,7 +186,7 @@ EFFECTS = {
         lambda: jeuler.PrescribedMotion([0], jeuler.SampledPath([0.0, 0.5, 1.0, 1.5], SAMPLES))
     ),
     "collisions": effect(lambda: jeuler.Collisions(SOLIDS, radius=0.05, restitution=0.5, friction=0.3), "unresolved_contacts"),
-    "colliding_pairs": effect(lambda: jeuler.Collisions(pairs=[(1, 2)], radius=0.2, restitution=0.5), "unresolved_contacts"),
+    "colliding_pairs": effect(lambda: jeuler.Collisions(pairs="near", radius=0.2, restitution=0.5), "unresolved_contacts"),
     "distance_links": effect(lambda: jeuler.DistanceLinks([(0, 1), (1, 2)], length=[1.0, 0.8]), "unresolved_links"),
     "breaking": effect(lambda: jeuler.Breaking(jeuler.BreakableSprings(NET_EDGES, 30.0, 0.7, 0.9), 0.4), "broken", "broken_springs"),
     "neighbours": effect(

@@ -8,6 +8,8 @@ import pytest
 import jeuler
 from jeuler import Collisions, SampledPath
 from jeuler.contact.colliders import Box, Plane, Sphere
+from jeuler.contact.contacts import Contacts
+from jeuler.contact.paths import free_path
 
 G = 9.81
 FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
@@ -28,11 +30,11 @@ def on_floor(height=0.1, speed=0.0, g=G, *, num_steps, dt=1e-3, step=jeuler.symp
     return jeuler.simulate(scene, state, dt=dt, num_steps=num_steps, step=step)
 
 
-@pytest.mark.parametrize("num_steps", [1, 7])
-def test_two_elastic_balls_and_the_gradient_of_where_the_second_ends(num_steps):
+@pytest.mark.parametrize(("num_steps", "pairs"), [(1, [(0, 1)]), (7, "near")])
+def test_two_elastic_balls_and_the_gradient_of_where_the_second_ends(num_steps, pairs):
     def end(q):
         state = jeuler.ParticleState(q[:2, None], q[2:, None])
-        scene = jeuler.Scene(effects=(Collisions(pairs=[(0, 1)], radius=0.1, restitution=1.0),))
+        scene = jeuler.Scene(effects=(Collisions(pairs=pairs, radius=0.1, restitution=1.0),))
         return jeuler.simulate(scene, state, dt=1 / num_steps, num_steps=num_steps).y.position[-1, 1, 0]
 
     q = np.array([0.0, 0.52, 1.0, 0.0])
@@ -224,6 +226,35 @@ def test_second_derivative_through_a_bounce_off_a_sphere():
     np.testing.assert_allclose(jax.jit(jax.hessian(end))(0.05), (slope_above - slope_below) / (2 * h), rtol=1e-6)
 
 
+@pytest.mark.parametrize("capacity", [None, 2])
+def test_near_pairs_are_those_that_can_meet_and_others_are_counted(capacity):
+    """On a grid with equal, touching and coinciding balls; the dead and pairs that cannot move are no pairs."""
+    x = 0.2 * np.stack(np.meshgrid(*[np.arange(7.0)] * 2), axis=-1).reshape(-1, 2)
+    x[20], x[30] = x[19], [np.nan, 0.0]
+    mass, alive = np.where(np.arange(49) % 3 == 0, np.inf, 1.0), np.arange(49) != 8
+    way = np.where(np.arange(49) == 3, 0.02, 0.01)[:, None] * [1.0, 0.0]
+    balls = Collisions(pairs="near", radius=0.1, capacity=capacity)
+
+    @jax.jit
+    def those(x):
+        contacts = Contacts(balls, jnp.zeros(()), jnp.ones(()), x, jnp.asarray(mass), jnp.asarray(alive))
+        contacts.near(free_path(x, jnp.asarray(way), 0 * x, 1.0))
+        return jnp.stack([contacts.i, contacts.j], axis=1), contacts.listed, contacts.left_out
+
+    pairs, listed, left_out = those(x)
+    found = [(i, j) for i, j in pairs[np.asarray(listed)].tolist()]
+    i, j = np.triu_indices(49, 1)
+    d = np.linalg.norm(x[i] - x[j], axis=1) - 0.2
+    due = (d <= 4 * 0.02) & alive[i] & alive[j] & ~(np.isinf(mass[i]) & np.isinf(mass[j]))
+    truth = {(a, b) for a, b in np.stack([i, j], axis=1)[due].tolist()}
+    if capacity is None:
+        assert sorted(truth) == found, "in the order of named pairs"
+        assert int(left_out) == 0
+    else:
+        assert set(found) < truth
+        assert int(left_out) >= len(truth) - len(found)
+
+
 def test_no_collisions_unless_called_for():
     """Particles pass through each other when no pair is named."""
     state = jeuler.ParticleState([[0.0], [1.0]], [[1.0], [-1.0]])
@@ -240,6 +271,8 @@ def test_no_collisions_unless_called_for():
         ({"pairs": [(0, 0)]}, "pairs must be different particles"),
         ({"pairs": [(0, 5)]}, "below 1"),
         ({"pairs": [(0.0, 1.0)]}, "integers"),
+        ({"pairs": "close"}, 'or "near"'),
+        ({"capacity": 4}, 'pairs="near" alone'),
         ({"max_bounces": 0}, "max_bounces"),
         ({"colliders": FLOOR}, "tuple"),
         ({"colliders": (Plane([0.0], [1.0]),)}, "Plane.point must have shape"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ from jeuler.contact.within_step import answer, resolve
 FEW_PAIRS = 32  # of them, XLA's faster loops do not pay for their compilation
 
 
-@component(static=("pairs", "max_bounces"), positive=("radius", "restitution", "friction"))
+@component(static=("pairs", "max_bounces", "capacity"), positive=("radius", "restitution", "friction"))
 class Collisions:
     """Contact with restitution and Coulomb friction, resolved where on its way a particle meets the surface.
 
@@ -33,17 +33,20 @@ class Collisions:
     than the forces of one step can make it rests: contact forces hold it through the step, stacks and piles too.
     Overlaps of what rests are closed by displacements. What could not be resolved is counted in
     ``Solution.unresolved_contacts``. Beside the library's implicit steps what rests is part of the solve. Particles do
-    not collide with each other unless ``pairs`` names them. Pinned particles (mass = inf) and prescribed ones are never
+    not collide with each other unless ``pairs`` says so. Pinned particles (mass = inf) and prescribed ones are never
     moved. Where a signed distance is NaN, so is the particle.
 
     Args:
       colliders: `Plane`, `Sphere`, `Box`, or any signed distance ``(t, point) -> ()``; a tuple.
-      pairs: the pairs (i, j) of particles that collide as balls, integers (pair, 2). Static.
+      pairs: the pairs (i, j) of particles that collide as balls, integers (pair, 2); "near" for all that come within
+        reach of each other, found at each step. Static.
       radius: of each particle, () or (particle,), m. Differentiable.
       restitution: 1 elastic, 0 no bounce, (). Differentiable.
       friction: Coulomb's coefficient, (). Differentiable.
       max_bounces: rounds of impacts that are followed within one step, those that come at once in different places in
         one; None: 8, with pairs 32. What is left is counted. Static.
+      capacity: with "near", the most balls that may be within the reach of one in a step, 2 max(radius) and four times
+        the longest way; None: 24, enough for balls of like size. Those beyond it are counted too. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state at the end of the step. Without
       ``previous``, the state before the step is taken to be the one from which this velocity leads to this position.
     Raises: ValueError, if a value is out of its range; in `simulate`, if an index or a shape does not fit.
@@ -61,11 +64,12 @@ class Collisions:
     """
 
     colliders: tuple[ColliderLike, ...] = ()
-    pairs: tuple[tuple[int, int], ...] = ()
+    pairs: tuple[tuple[int, int], ...] | Literal["near"] = ()
     radius: Parameter = default(0.0)
     restitution: Parameter = default(0.0)
     friction: Parameter = default(0.0)
     max_bounces: int | None = None
+    capacity: int | None = None
 
     needs: ClassVar[tuple[str, ...]] = ("forward time", "prescribed pinned", "the solve")
 
@@ -79,6 +83,12 @@ class Collisions:
         object.__setattr__(self, "pairs", _pairs(self.pairs))
         if self.max_bounces is not None:
             checks.count("Collisions.max_bounces", self.max_bounces, least=1)
+        if self.capacity is not None:
+            checks.count("Collisions.capacity", self.capacity, least=1)
+            if self.pairs != "near":
+                raise ValueError(
+                    'Collisions.capacity is of pairs="near" alone, got pairs by their indices; leave it out'
+                )
         store_as_float(self, "radius", "restitution", "friction")
         for name, most in (("radius", np.inf), ("restitution", 1.0), ("friction", np.inf)):
             value = getattr(self, name)
@@ -115,6 +125,8 @@ class Collisions:
     @property
     def is_long_code(self) -> bool:
         """Whether compiling a run takes longer than it runs: contacts that may be several at once, and not many."""
+        if self.pairs == "near":
+            return False
         return (len(self.colliders) > 1 or len(self.pairs) > 0) and len(self.pairs) <= FEW_PAIRS
 
     def _rounds(self) -> int:
@@ -123,7 +135,7 @@ class Collisions:
         return 32 if self.pairs else 8
 
     def check(self, particles: int, dim: int) -> None:
-        for i, j in self.pairs:
+        for i, j in () if self.pairs == "near" else self.pairs:
             if max(i, j) >= particles:
                 raise ValueError(f"Collisions.pairs must be indices below {particles}, got ({i}, {j})")
         for name, shapes in (("radius", ((), (particles,))), ("restitution", ((),)), ("friction", ((),))):
@@ -137,8 +149,10 @@ def has_long_code(effects: Sequence[Any]) -> bool:
     return any(effect.is_long_code for effect in effects if isinstance(effect, Collisions))
 
 
-def _pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
-    array = checks.integers("Collisions.pairs", pairs, "integers of shape (pair, 2)")
+def _pairs(pairs: Any) -> tuple[tuple[int, int], ...] | Literal["near"]:
+    if isinstance(pairs, str) and pairs == "near":
+        return "near"
+    array = checks.integers("Collisions.pairs", pairs, 'integers of shape (pair, 2), or "near"')
     if array.size == 0:
         return ()
     if array.ndim != 2 or array.shape[1] != 2:

@@ -8,15 +8,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from jeuler._core.vectors import direction, length, unit
 from jeuler.contact.paths import Path
+from jeuler.graphs.cells import rows_of_neighbours
 
 DENSE_UP_TO = 96  # unknowns of the contacts at rest that are solved for by a matrix
 NARROWER = 8  # reaches, each half of the one before, that are tried where pairs are more than there is room for
 WAY_OF_FORCES = 1e3  # of an approach that is none, is the way that the forces of a step make
 TOUCH, LIFT = 8, 16  # units in the last place of the coordinates
+ROW = 24  # balls within reach of one: 12 can touch one of their size in space
 CANDIDATES = 2  # pairs followed in a step, for each particle and dimension, where there are many more of them
 
 
@@ -40,6 +42,7 @@ class Contacts:
     colliders: tuple[Any, ...]
     particles: int
     dim: int
+    row: int  # the most balls within reach of one, where `near` is to find the pairs; 0 where they are named
     t0: Array
     dt: Array
     restitution: Array
@@ -61,21 +64,23 @@ class Contacts:
         mass = mass if alive is None else jnp.where(alive, mass, jnp.inf)  # whatever the mass of a dead slot is
         self.inverse_mass = jnp.broadcast_to(1 / mass.astype(dtype), self.particles)
         self.alive = jnp.ones(self.particles, bool) if alive is None else alive
-        self.i, self.j = (jnp.asarray(k) for k in np.array(collisions.pairs, np.int32).reshape(-1, 2).T)
+        self.row = (collisions.capacity or ROW) if collisions.pairs == "near" else 0
+        pairs = () if self.row else collisions.pairs
+        self.i, self.j = (jnp.asarray(k) for k in np.array(pairs, np.int32).reshape(-1, 2).T)
         self.listed = jnp.ones(len(self.i), bool)
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
         self.resting: Array | bool = False  # (contact,), which are held from the start of the step
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        sizes = ("particles", "dim")
+        sizes = ("particles", "dim", "row")
         names = tuple(name for name in vars(self) if name not in sizes)
-        return tuple(getattr(self, name) for name in names), (names, self.particles, self.dim)
+        return tuple(getattr(self, name) for name in names), (names, self.particles, self.dim, self.row)
 
     @classmethod
     def tree_unflatten(cls, kept: tuple[Any, ...], values: tuple[Any, ...]) -> Contacts:
         self = object.__new__(cls)
-        names, self.particles, self.dim = kept
+        names, self.particles, self.dim, self.row = kept
         vars(self).update(zip(names, values, strict=True))
         return self
 
@@ -118,6 +123,8 @@ class Contacts:
         nearer, the nearest are kept.
         """
         capacity = CANDIDATES * self.dim * self.particles
+        if self.row:
+            return self._find(path, capacity)
         if len(self.i) <= 2 * capacity:
             return
         way = jax.lax.stop_gradient(length(path.way) + length(path.bend))
@@ -133,6 +140,23 @@ class Contacts:
         self.left_out = (numbers[0] - number).astype(jnp.int32)
         self.i, self.j = self.i[kept], self.j[kept]
         self.listed = jnp.arange(capacity) < number
+
+    def _find(self, path: Path, capacity: int) -> None:
+        """The pairs of all balls that can meet in this step, by a list of cells; those beyond the rows are counted."""
+        n, capacity = self.particles, min(capacity, self.particles * (self.particles - 1) // 2)
+        x, way, radius = lax.stop_gradient((path.x, length(path.way) + length(path.bend), self.radius))
+        way = 4 * jnp.max(jnp.where(self.alive & jnp.isfinite(way), way, 0), initial=0)
+        coarse = 1e-6 * jnp.max(jnp.where(jnp.isfinite(x), jnp.abs(x), 0), initial=1e-30)  # cells are counted by int32
+        reach = jnp.maximum(2 * jnp.max(radius, initial=0) + way, coarse)
+        rows, missed = rows_of_neighbours(x, self.alive, 1.001 * reach, self.row, self.row // 2 + 4, None)
+        i, j = jnp.broadcast_to(jnp.arange(n)[:, None], rows.shape), jnp.maximum(jnp.sort(rows, axis=1), 0)
+        moves = self.inverse_mass[i] + self.inverse_mass[j] > 0
+        wanted = (j > i) & moves & (length(x[i] - x[j]) - radius[i] - radius[j] <= way)
+        number = jnp.sum(wanted, dtype=jnp.int32)
+        kept = jnp.nonzero(wanted.ravel(), size=capacity, fill_value=0)[0]
+        self.listed = jnp.arange(capacity) < number
+        self.left_out = missed + jnp.maximum(number - capacity, 0)
+        self.i, self.j = (jnp.where(self.listed, k.ravel()[kept], none) for k, none in ((i, 0), (j, 1)))
 
     def convex(self) -> Array:
         """Where the gap is a convex function of the place of the first partner relative to the second."""
