@@ -120,6 +120,7 @@ FORCES = {
     "torsion": lambda: jeuler.Torsion(STRAND, 0.4, 2.0),
     "gravity": lambda: jeuler.Gravity([0.3, -9.81]),
     "springs": lambda: jeuler.Springs(NET_EDGES, ks=np.linspace(20.0, 60.0, 5), kd=0.7, rest_length=0.9),
+    "springs_in_a_box": lambda: jeuler.Springs(NET_EDGES, ks=30.0, kd=0.7, rest_length=0.5, box=[1.7, 1.5]),
     "springs_without_length": lambda: jeuler.Springs(NET_EDGES, ks=30.0, kd=np.linspace(0.1, 1.0, 5), rest_length=0.0),
     "no_springs": lambda: jeuler.Springs([], ks=30.0, kd=1.0, rest_length=1.0),
     "linear_drag": lambda: jeuler.LinearDrag(0.4),
@@ -144,7 +145,7 @@ FORCES = {
 IN_SPACE = ("strand_bending", "strand_core", "torsion")
 # action equals reaction; and those whose forces have no torque either
 INTERNAL_FORCES = (
-    "springs", "springs_without_length", "no_springs", "cubic_springs", "strings", "viscosity", "bending", "shape_matching", *IN_SPACE,
+    "springs", "springs_in_a_box", "springs_without_length", "no_springs", "cubic_springs", "strings", "viscosity", "bending", "shape_matching", *IN_SPACE,
 )  # fmt: skip
 CENTRAL_FORCES = (
     "springs",

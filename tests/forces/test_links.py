@@ -61,3 +61,35 @@ def test_torsion_has_the_dihedral_angle_and_no_jump_where_it_wraps():
     state = jeuler.ParticleState(jnp.zeros((4, 2)), jnp.zeros((4, 2)))
     with pytest.raises(ValueError, match="dim = 3"):
         jeuler.simulate(Scene((Torsion([[0, 1, 2, 3]], 2.0),)), state, dt=0.1, num_steps=1)
+
+
+@pytest.mark.parametrize("kind", [jeuler.Springs, jeuler.CubicSprings, jeuler.Strings, jeuler.BreakableSprings])
+def test_links_in_periodic_space_are_those_to_the_nearest_image(kind, random):
+    """A net of offsets and chance across the borders: whole boxes away, each particle feels the same as in free space."""
+    n, box = 40, np.array([3.0, 4.0])
+    x, v = np.cumsum(random.uniform(-0.6, 0.6, (2, n, 2)), axis=1)
+    edges = np.array([(k, k + 1) for k in range(n - 1)] + [(0, 2), (7, 5)])
+    laws = {"ks": random.uniform(1, 2, len(edges)), "kd": 0.3, "rest_length": 0.5}
+    laws |= {"cubic": 2.0} if kind is jeuler.CubicSprings else {}
+    broken = (jnp.arange(len(edges))[None] == 3,) if kind is jeuler.BreakableSprings else ()
+    folded = x + box * random.integers(-2, 3, (n, 2))
+    rest = 0.0, jnp.asarray(v), jnp.ones(()), *broken
+
+    def force(links, x):
+        return links(rest[0], jnp.asarray(x), *rest[1:])
+
+    links, free = kind(edges, **laws, box=box), kind(edges, **laws)
+    np.testing.assert_allclose(force(links, folded), force(free, x), atol=1e-12)
+    np.testing.assert_allclose(jnp.sum(force(links, folded), axis=0), 0, atol=1e-12)
+    assert not np.allclose(force(free, folded), force(free, x)), "the test would see the box ignored"
+    if hasattr(links, "energy"):
+        at = jnp.asarray(folded), jnp.ones(())
+        np.testing.assert_allclose(links.energy(0.0, *at), free.energy(0.0, jnp.asarray(x), at[1]), rtol=1e-12)
+
+        def energy(scale):
+            return kind(edges, **laws, box=box * scale).energy(0.0, *at)
+
+        slope = (energy(1 + 1e-6) - energy(1 - 1e-6)) / 2e-6
+        np.testing.assert_allclose(jax.grad(energy)(1.0), slope, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"box must have shape \(2,\)"):
+        kind(edges, **laws, box=[1.0]).check(n, 2)

@@ -13,6 +13,7 @@ from jeuler._core.component import component, store_as_float
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import direction
 from jeuler.forces.links import BreakableSprings
+from jeuler.forces.prepared import in_box
 from jeuler.particles.fields import START
 from jeuler.particles.state import FieldForm
 
@@ -64,7 +65,7 @@ class Breaking:
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Any) -> Any:
         edges = self.springs.edges
-        r, _ = direction(edges.difference(state.position))
+        r, _ = direction(edges.difference(state.position, in_box(self.springs.box, state.position.dtype)))
         too_long = r[:, 0] > (1 + self.max_strain) * self.springs.rest_length
         if state.alive is not None:
             too_long = too_long & jnp.all(state.alive[edges[:]], axis=1)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.annotations import Parameter, ParticleIndices
+from jeuler._core.annotations import OptionalParameter, Parameter, ParticleIndices, default
 from jeuler._core.component import component, store_as_float
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction
-from jeuler.forces.prepared import PreparedLinks
+from jeuler.forces.prepared import PreparedLinks, check_box, in_box
 from jeuler.forces.springs import coefficient
 from jeuler.graphs.topology import topology
 
@@ -38,13 +38,16 @@ class _Links:
 
     edges: Any
     rest_length: Any
+    box: Any
     law: ClassVar[Callable[..., Array]]
     names: ClassVar[tuple[str, ...]] = ("ks", "kd", "rest_length")
-    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
+    limits: ClassVar[dict[str, Any]] = {
+        "ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m"), "box": ("> 0", "m"),
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", topology(self.edges))
-        store_as_float(self, *self.names)
+        store_as_float(self, *self.names, "box")
 
     def prepare(self, context: Any) -> PreparedLinks | None:
         """The links between the living, laid out for the kernels; None where there are none."""
@@ -53,20 +56,22 @@ class _Links:
         return self.laid_out(context.particles, context.dtype, context.limits_drag).prepare(context)
 
     def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedLinks:
-        layouts = self.edges.layouts(particles)
+        layouts = self.edges.layouts(particles, shifts=self.box is None)
         values = [getattr(self, name).astype(dtype) for name in self.names]
         slots = [[layout.to_slots(x) for layout in layouts] for x in values]
-        return PreparedLinks(self.edges, layouts, type(self).law, self.names, read_again, slots)
+        law, box = type(self).law, in_box(self.box, dtype)
+        return PreparedLinks(self.edges, layouts, law, self.names, read_again, slots, box)
 
     def check(self, particles: int, dim: int) -> None:
         self.edges.check(particles)
         for name in self.names:
             where = f"{type(self).__name__}.{name}"
             checks.shape(where, getattr(self, name).shape, (), (len(self.edges),), meaning="one a link")
+        check_box(self, dim)
         check_limits(self)
 
     def _stretch(self, position: Array) -> Array:
-        r, _ = direction(self.edges.difference(position))
+        r, _ = direction(self.edges.difference(position, in_box(self.box, position.dtype)))
         return r[:, 0] - self.rest_length.astype(position.dtype)
 
 
@@ -77,7 +82,7 @@ class _LastingLinks(_Links):
         return self.laid_out(len(position), position.dtype)(t, position, velocity, mass)
 
 
-@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+@component(static=("edges",), parameters=("ks", "kd", "rest_length", "cubic"), positive=("ks", "kd", "rest_length"))
 class CubicSprings(_LastingLinks):
     """Springs that grow stiffer, or softer, as they are stretched (Duffing's), with dampers.
 
@@ -89,6 +94,7 @@ class CubicSprings(_LastingLinks):
       kd: damping, () or (spring,), N s/m. Differentiable.
       rest_length: L, () or (spring,), m. Differentiable.
       cubic: () or (spring,), N/m^3; above 0 hardens, below 0 softens. Differentiable.
+      box: (dim,), m, the sides of periodic space, as for `Springs`; None for free space. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if edges is not an integer (spring, 2) array; in `simulate`, if an index is out of range, a
       parameter has another shape, or ks, kd or rest_length is negative.
@@ -106,6 +112,7 @@ class CubicSprings(_LastingLinks):
     kd: Parameter
     rest_length: Parameter
     cubic: Parameter
+    box: OptionalParameter = default(None)
 
     law: ClassVar[Callable[..., Array]] = staticmethod(cubic_coefficient)
     names: ClassVar[tuple[str, ...]] = ("ks", "kd", "rest_length", "cubic")
@@ -117,7 +124,7 @@ class CubicSprings(_LastingLinks):
         return jnp.sum(self.ks.astype(s.dtype) * s**2 / 2 + self.cubic.astype(s.dtype) * s**4 / 4)
 
 
-@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+@component(static=("edges",), parameters=("ks", "kd", "rest_length"), positive=("ks", "kd", "rest_length"))
 class Strings(_LastingLinks):
     """Strings: they pull where they are longer than their rest length, and are slack where they are shorter.
 
@@ -130,6 +137,7 @@ class Strings(_LastingLinks):
       ks: stiffness, () or (string,), N/m. Differentiable.
       kd: damping, () or (string,), N s/m. Differentiable.
       rest_length: L, () or (string,), m. Differentiable.
+      box: (dim,), m, the sides of periodic space, as for `Springs`; None for free space. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if edges is not an integer (string, 2) array; in `simulate`, if an index is out of range, or a
       parameter has another shape or is negative.
@@ -144,6 +152,7 @@ class Strings(_LastingLinks):
     ks: Parameter
     kd: Parameter
     rest_length: Parameter
+    box: OptionalParameter = default(None)
 
     law: ClassVar[Callable[..., Array]] = staticmethod(string_coefficient)
 
@@ -153,7 +162,7 @@ class Strings(_LastingLinks):
         return jnp.sum(self.ks.astype(s.dtype) * s**2) / 2
 
 
-@component(static=("edges",), positive=("ks", "kd", "rest_length"))
+@component(static=("edges",), parameters=("ks", "kd", "rest_length"), positive=("ks", "kd", "rest_length"))
 class BreakableSprings(_Links):
     """Springs with dampers that are gone once they are broken: `Breaking` says which are.
 
@@ -164,6 +173,7 @@ class BreakableSprings(_Links):
       ks: stiffness, () or (spring,), N/m. Differentiable.
       kd: damping, () or (spring,), N s/m. Differentiable.
       rest_length: L, () or (spring,), m. Differentiable.
+      box: (dim,), m, the sides of periodic space, as for `Springs`; None for free space. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass, broken)``, the force on each particle, (particle, dim),
       N; broken is (1, spring), boolean.
     Raises: ValueError, in `simulate`, if the scene has no `Breaking` with as many springs, an index is out of range, or
@@ -182,6 +192,7 @@ class BreakableSprings(_Links):
     ks: Parameter
     kd: Parameter
     rest_length: Parameter
+    box: OptionalParameter = default(None)
 
     law: ClassVar[Callable[..., Array]] = staticmethod(coefficient)
     reads: ClassVar[tuple[str, ...]] = ("broken",)

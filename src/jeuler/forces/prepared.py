@@ -28,15 +28,17 @@ class PreparedLinks:
     names: tuple[str, ...]
     read_again: bool  # see `Layout.central_force`
     parameters: Any  # of each name, what `Layout.to_slots` made of it
+    box: Array | None = None  # (dim,), m, the sides of periodic space
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array, broken: Array | None = None) -> Array:
         if broken is not None:
             checks.shape("state.broken", broken.shape, (1, len(self.edges)), meaning="one a spring; see Breaking")
             return self.only(~broken[0])(t, position, velocity, mass)
         x, v = split(position), split(velocity)
+        box = None if self.box is None else list(self.box)
         total = [jnp.zeros_like(component) for component in x]
         for layout, *parameters in zip(self.layouts, *self.parameters, strict=True):
-            shares = layout.central_force(self.law, x, v, parameters, self.read_again)
+            shares = layout.central_force(self.law, x, v, parameters, self.read_again, box)
             total = [a + b for a, b in zip(total, shares, strict=True)]
         return stack(total)
 
@@ -56,3 +58,14 @@ class PreparedLinks:
 
         pairs = zip(self.names, self.parameters, strict=True)
         return replace(self, parameters=[only_here(name, parameter) for name, parameter in pairs])
+
+
+def in_box(box: Array | None, dtype: Any) -> Array | None:
+    """The sides of periodic space as the kernels take them."""
+    return None if box is None else box.astype(dtype)
+
+
+def check_box(links: Any, dim: int) -> None:
+    """One ValueError if the sides of periodic space are not one a dimension."""
+    if links.box is not None:
+        checks.shape(f"{type(links).__name__}.box", links.box.shape, (dim,), meaning="one side a dimension")

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jax import Array
 
 from jeuler._core import checks
-from jeuler._core.annotations import MovingParameter, ParticleIndices
+from jeuler._core.annotations import MovingParameter, OptionalParameter, ParticleIndices, default
 from jeuler._core.component import component, replace, store_as_float
 from jeuler._core.components import per_particle
 from jeuler._core.in_time import at_time, moving
 from jeuler._core.limits import check_limits
 from jeuler._core.vectors import apart, direction, dot
 from jeuler._jax.materialise import stored
-from jeuler.forces.prepared import PreparedLinks
+from jeuler.forces.prepared import PreparedLinks, check_box, in_box
 from jeuler.graphs.topology import topology
 
 
@@ -63,7 +63,7 @@ def _coefficient_jvp(primals, tangents):
 PARAMETERS = ("ks", "kd", "rest_length")
 
 
-@component(static=("edges",), positive=PARAMETERS)
+@component(static=("edges",), parameters=PARAMETERS, positive=PARAMETERS)
 class Springs:
     """Linear springs and dampers between pairs of particles.
 
@@ -78,6 +78,8 @@ class Springs:
         of a muscle. Differentiable.
       kd: damping of each spring, shape () or (spring,), N s/m, or a function of time. Differentiable.
       rest_length: L, length without force, shape () or (spring,), m, or a function of time. Differentiable.
+      box: (dim,), m, the sides of periodic space, in which d is that to the nearest image, no longer than half a side
+        along each axis; None for free space. Differentiable.
     Returns: called as a force ``(t, position, velocity, mass)``, the force on each particle, (particle, dim), N.
     Raises: ValueError, if edges is not an integer (spring, 2) array or joins a particle to itself; in
       `simulate`, if an index is out of range, a parameter has another shape, or one that is not traced is negative.
@@ -94,8 +96,11 @@ class Springs:
     ks: MovingParameter
     kd: MovingParameter
     rest_length: MovingParameter
+    box: OptionalParameter = default(None)
 
-    limits: ClassVar[dict[str, Any]] = {"ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m")}
+    limits: ClassVar[dict[str, Any]] = {
+        "ks": (">= 0", "N/m"), "kd": (">= 0", "N s/m"), "rest_length": (">= 0", "m"), "box": ("> 0", "m"),
+    }  # fmt: skip
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "edges", topology(self.edges))
@@ -104,6 +109,7 @@ class Springs:
                 object.__setattr__(self, name, moving(f"Springs.{name}", getattr(self, name)))
             else:
                 store_as_float(self, name)
+        store_as_float(self, "box")
 
     def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
         return self.at(t, position.dtype).laid_out(len(position), position.dtype)(t, position, velocity, mass)
@@ -129,16 +135,16 @@ class Springs:
 
     def laid_out(self, particles: int, dtype: Any, read_again: bool = False) -> PreparedLinks:
         """The same force with its parameters in the slots of each layout, which is the same work at every step."""
-        layouts = self.edges.layouts(particles)
+        layouts = self.edges.layouts(particles, shifts=self.box is None)
         values = [getattr(self, name).astype(dtype) for name in PARAMETERS]
         slots = [[layout.to_slots(x) for layout in layouts] for x in values]
-        return PreparedLinks(self.edges, layouts, coefficient, PARAMETERS, read_again, slots)
+        return PreparedLinks(self.edges, layouts, coefficient, PARAMETERS, read_again, slots, in_box(self.box, dtype))
 
     def energy(self, t: Any, position: Array, mass: Array) -> Array:
         """Potential energy sum ks (r - L)^2 / 2, J."""
         now = self.at(t, position.dtype)
         ks, rest_length = (per_particle(x.astype(position.dtype)) for x in (now.ks, now.rest_length))
-        r, _ = direction(self.edges.difference(position))
+        r, _ = direction(self.edges.difference(position, in_box(self.box, position.dtype)))
         return jnp.sum(ks * (r - rest_length) ** 2) / 2
 
     def tension(self, t: Any, state: Any) -> Array:
@@ -173,7 +179,7 @@ class Springs:
         self.check(*state.position.shape)
         dtype = state.position.dtype
         now = self.at(t, dtype)
-        r, u = direction(self.edges.difference(state.position))
+        r, u = direction(self.edges.difference(state.position, in_box(self.box, dtype)))
         rate = jnp.sum(self.edges.difference(state.velocity) * u, axis=1)
         here = True if state.alive is None else jnp.all(state.alive[self.edges[:]], axis=1)
         return now.ks.astype(dtype), now.kd.astype(dtype), now.rest_length.astype(dtype), r[:, 0], rate, here
@@ -184,6 +190,7 @@ class Springs:
             value = getattr(self, name)
             shape = (checks.form_of(f"Springs.{name}", at_time, value, 0.0) if callable(value) else value).shape
             checks.shape(f"Springs.{name}", shape, (), (len(self.edges),), meaning="one a spring")
+        check_box(self, dim)
         check_limits(self)
 
 

@@ -23,6 +23,7 @@ from jax import Array
 from jeuler._core.vectors import dot, total
 from jeuler._jax.materialise import as_stored, kept, stored
 from jeuler.graphs import incidence
+from jeuler.graphs.cells import nearest_image
 from jeuler.graphs.laplacian import laplacian, products
 
 Law = Callable[..., Array]  # (square, approach, *parameters) -> c, elementwise
@@ -42,12 +43,18 @@ class Layout(abc.ABC):
 
     @abc.abstractmethod
     def central_force(
-        self, law: Law, x: Components, v: Components, parameters: Sequence[Slots], read_again: bool = False
+        self,
+        law: Law,
+        x: Components,
+        v: Components,
+        parameters: Sequence[Slots],
+        read_again: bool = False,
+        box: Components | None = None,
     ) -> list[Array]:
         """B^T (c B x) with c = law(|B x|^2, (B v).(B x), *parameters): (particle,) for each component of x.
 
         Parameters are what `to_slots` made of them. ``read_again``: more than one kernel reads the force, as one does
-        that limits a quadratic drag.
+        that limits a quadratic drag. ``box``: the sides of periodic space, in which B x is that to the nearest image.
         """
 
     def to_slots(self, x: Array) -> Slots:
@@ -73,10 +80,17 @@ class Indexed(Layout):
     tables: tuple[np.ndarray, ...]
 
     def central_force(
-        self, law: Law, x: Components, v: Components, parameters: Sequence[Slots], read_again: bool = False
+        self,
+        law: Law,
+        x: Components,
+        v: Components,
+        parameters: Sequence[Slots],
+        read_again: bool = False,
+        box: Components | None = None,
     ) -> list[Array]:
         # both ends read one slot: d is stored, its cotangent too, not computed again for either
-        d = [stored(self.difference(component)) for component in x]
+        sides = [None] * len(x) if box is None else box
+        d = [stored(nearest_image(self.difference(one), side)) for one, side in zip(x, sides, strict=True)]
         s = [self.difference(component) for component in v]
         c = stored(law(dot(d, d), dot(s, d), *(parameter for (parameter,) in parameters)))
         return [self.accumulate(c * component) for component in d]
@@ -118,8 +132,15 @@ class Shifts(Layout):
         self.slot_edges: tuple[np.ndarray, ...] = tuple(groups)
 
     def central_force(
-        self, law: Law, x: Components, v: Components, parameters: Sequence[Slots], read_again: bool = False
+        self,
+        law: Law,
+        x: Components,
+        v: Components,
+        parameters: Sequence[Slots],
+        read_again: bool = False,
+        box: Components | None = None,
     ) -> list[Array]:
+        assert box is None, "edges of periodic space are not laid out so, see Topology.layouts"
         x, v = ([kept(component) for component in y] for y in (x, v))
         squares, approaches = (self.dot_differences(y, x) for y in (x, v))
         values = map(law, squares, approaches, *map(self.by_group, parameters))

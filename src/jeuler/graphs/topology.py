@@ -13,6 +13,7 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.indices import Indices
+from jeuler.graphs.cells import nearest_image
 from jeuler.graphs.layouts import Layout, Pairs, Rows, Shifts
 
 MOST_GROUPS = 32  # offsets that get a group of their own: the length of the program, not its speed, sets this
@@ -55,18 +56,19 @@ class Topology(Indices):
                 f"got edges[{first}] = {self[first].tolist()}"
             )
 
-    def layouts(self, particles: int) -> tuple[Layout, ...]:
+    def layouts(self, particles: int, shifts: bool = True) -> tuple[Layout, ...]:
         """The edges laid out in memory for the fastest kernels, each edge in one layout; made once and kept.
 
         The rule: an offset k = |i - j| gets a group of `Shifts` if its edges would cost more in `Rows`, that is if
         there are more than (particles + k) / SHIFT_GAIN of them, at most MOST_GROUPS offsets, the commonest first. The
-        other edges are `Pairs` if there are fewer than MANY of them, or than one in FEW particles, else `Rows`.
+        other edges are `Pairs` if there are fewer than MANY of them, or than one in FEW particles, else `Rows`. Without
+        ``shifts`` all are these: in periodic space a difference is not that of two shifted arrays.
         """
-        return _layouts(self, particles)
+        return _layouts(self, particles, shifts)
 
-    def difference(self, x: Array) -> Array:
-        """B x: (particle, dim) to (spring, dim)."""
-        return x[self[:, 0]] - x[self[:, 1]]
+    def difference(self, x: Array, box: Array | None = None) -> Array:
+        """B x: (particle, dim) to (spring, dim); to the nearest image in a periodic box (dim,)."""
+        return nearest_image(x[self[:, 0]] - x[self[:, 1]], box)
 
     def accumulate(self, force: Array, particles: int) -> Array:
         """B^T f: (spring, dim) to (particle, dim)."""
@@ -96,13 +98,13 @@ _made: weakref.WeakValueDictionary[Any, Topology] = weakref.WeakValueDictionary(
 
 
 @functools.lru_cache(maxsize=64)
-def _layouts(topology: Topology, particles: int) -> tuple[Layout, ...]:
+def _layouts(topology: Topology, particles: int, shifts: bool) -> tuple[Layout, ...]:
     edges, numbers = topology.indices, np.arange(len(topology))
     if not len(edges):
         return ()
     offset = np.abs(edges[:, 1] - edges[:, 0])
     offsets, counts = np.unique(offset, return_counts=True)
-    worth = SHIFT_GAIN * counts > particles + offsets
+    worth = shifts & (SHIFT_GAIN * counts > particles + offsets)
     commonest = np.argsort(-counts[worth], kind="stable")[:MOST_GROUPS]
     regular = np.isin(offset, offsets[worth][commonest]) & _first_of_its_kind(edges)
     others = ~regular

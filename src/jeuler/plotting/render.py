@@ -146,9 +146,19 @@ def springs_of(scene: Any) -> list[Any]:
     return [force for force in getattr(scene, "forces", ()) if hasattr(force, "rest_length")]
 
 
+def ends_of(force: Any, position: np.ndarray) -> np.ndarray:
+    """Both ends of each spring, (..., spring, 2, dim), the second at its image nearest to the first."""
+    ends = position[..., np.asarray(force.edges), :]
+    if getattr(force, "box", None) is not None:
+        box = np.asarray(force.box)
+        d = (ends[..., 0, :] - ends[..., 1, :])[..., : len(box)]  # what lies in a plane is drawn with a 0 more
+        ends[..., 1, : len(box)] += box * np.round(d / box)
+    return ends
+
+
 def color_of_strain(force: Any, position: np.ndarray, t: float) -> np.ndarray:
     """The colour of each spring by its strain, (spring, 4)."""
-    ends = position[np.asarray(force.edges)]
+    ends = ends_of(force, position)
     now = force.at(t) if hasattr(force, "at") else force
     rest = np.broadcast_to(np.asarray(now.rest_length), len(ends))
     strain = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / np.where(rest > 0, rest, 1) - 1
@@ -249,7 +259,7 @@ class Picture:
         seen = np.flatnonzero(alive[edges].all(axis=1))
         if self.dim == 3:  # the far ones first
             seen = seen[np.argsort(position[edges[seen]].mean(axis=1) @ self.view.toward_viewer(t))]
-        ends = position[edges[seen]]
+        ends = ends_of(force, position)[seen]
         lines.set_segments(ends)
         if self.look.links == "color":
             lines.set_color(rgba[edges[seen]].mean(axis=1))

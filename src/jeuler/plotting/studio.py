@@ -16,7 +16,7 @@ from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View
 from jeuler.plotting.light import light_through
 from jeuler.plotting.models import Model, Shadows, bake, copies, frame_along, model, unit
-from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, springs_of
+from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, ends_of, springs_of
 from jeuler.plotting.surfaces import ball, fine_mesh_of
 
 FINER = 2  # pixels drawn for one of the picture, each way
@@ -217,7 +217,7 @@ class Studio:
             strain = color_of_strain(force, self.position, self.t)
             color = self.rgba[edges].mean(axis=1) if self.look.links == "color" else strain
             here = np.isin(edges, self.index).all(axis=1)
-            made.append((self.position[edges[here]], color[here][:, None].repeat(2, 1), self.look.width))
+            made.append((ends_of(force, self.position)[here], color[here][:, None].repeat(2, 1), self.look.width))
         if self.look.particles == "streaks":
             back = SHUTTER * np.linspace(1, 0, 6)[:, None]
             curves = self.position[self.index][:, None] - back * self.velocity[self.index][:, None]

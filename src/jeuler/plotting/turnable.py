@@ -16,7 +16,7 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler.particles.state import ParticleState, check_run, in_space
 from jeuler.plotting.camera import Camera, View
-from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, springs_of
+from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, ends_of, springs_of
 from jeuler.plotting.solids import FILL
 from jeuler.plotting.surfaces import mesh_of
 
@@ -128,7 +128,7 @@ class TurnableView:
             ))  # fmt: skip
         for force in springs_of(self.scene) if self.look.links else []:
             edges = np.asarray(force.edges)
-            ends, whole = position[:, edges], alive[:, edges].all(axis=2)
+            ends, whole = ends_of(force, position), alive[:, edges].all(axis=2)
             ends = np.where(whole[..., None, None], ends, ends[:, :, :1]).reshape(len(times), -1, 3)
             color = [rgba[n][edges] if self.look.links == "color"
                      else color_of_strain(force, position[n], times[n])[:, None].repeat(2, 1)
