@@ -1,5 +1,7 @@
 """Files of runs: what is read back is what was written."""
 
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,9 +37,9 @@ def test_xyz_has_the_living_at_each_time(tmp_path):
 def test_vtk_has_points_and_the_lines_between_the_living(tmp_path):
     first, second = jeuler.export(run(), tmp_path / "run.vtk", edges=[[0, 1], [0, 2]])
     assert (first.name, second.name) == ("run_0000.vtk", "run_0001.vtk")
-    assert "LINES 2 6\n2 0 1\n2 0 2\n" in first.read_text()
+    assert "CELLS 5 12\n1 0\n1 1\n1 2\n2 0 1\n2 0 2\nCELL_TYPES 5\n1\n1\n1\n3\n3\n" in first.read_text()
     text = second.read_text()
-    assert "POINTS 2 double\n6 7 0\n10 11 0\nVERTICES 2 4\n1 0\n1 1\nLINES 1 3\n2 0 1\nPOINT_DATA 2\n" in text
+    assert "POINTS 2 double\n6 7 0\n10 11 0\nCELLS 3 7\n1 0\n1 1\n2 0 1\nCELL_TYPES 3\n1\n1\n3\nPOINT_DATA 2\n" in text
 
 
 def test_ply_has_points_colours_and_the_lines_between_the_living(tmp_path):
@@ -64,6 +66,42 @@ def test_nc_is_the_dataset_as_xarray_reads_it(tmp_path):
     assert made.attrs == {"first_nonfinite": -1, "unresolved_contacts": 0}
 
 
+@pytest.mark.parametrize("end", ["usd", "usda"])
+def test_usd_opens_with_its_own_library(tmp_path, end):
+    from pxr import Usd, UsdGeom
+
+    red = jnp.tile(jnp.array([1.0, 0.2, 0.0]), (2, 3, 1))
+    state = run().y.replace(color=red, size=jnp.full((2, 3), 0.1))
+    (path,) = jeuler.export(Solution(run().t, state, jnp.int32(-1)), tmp_path / f"run.{end}", edges=[[0, 1], [0, 2]])
+    stage = Usd.Stage.Open(str(path))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0.0, 12.0, 24.0)
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Z", 1.0)
+    points = UsdGeom.Points(stage.GetPrimAtPath("/run/particles"))
+    at = 12.0
+    np.testing.assert_array_equal(points.GetPointsAttr().Get(at), [[6, 7, 0], [10, 11, 0]])
+    np.testing.assert_array_equal(points.GetVelocitiesAttr().Get(at), [[-6, -7, 0], [-10, -11, 0]])
+    assert list(points.GetIdsAttr().Get(at)) == [0, 2]
+    np.testing.assert_allclose(points.GetWidthsAttr().Get(at), [0.1, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(points.GetDisplayColorPrimvar().Get(at), red[0, :2], rtol=1e-6)
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath("/run/edges"))
+    assert [list(curves.GetCurveVertexCountsAttr().Get(t)) for t in (0.0, at)] == [[2, 2], [2]]
+    np.testing.assert_array_equal(curves.GetPointsAttr().Get(at), [[6, 7, 0], [10, 11, 0]])
+
+
+def test_vtk_and_ply_open_with_libraries_of_their_own(tmp_path):
+    import meshio
+    import plyfile
+
+    edges = [[0, 1], [0, 2]]
+    mesh = meshio.read(jeuler.export(run(), tmp_path / "run.vtk", edges=edges)[1])
+    np.testing.assert_array_equal(mesh.points, [[6, 7, 0], [10, 11, 0]])
+    np.testing.assert_array_equal(mesh.point_data["velocity"], [[-6, -7, 0], [-10, -11, 0]])
+    assert mesh.cells_dict["line"].tolist() == [[0, 1]]
+    ply = plyfile.PlyData.read(str(jeuler.export(run(), tmp_path / "run.ply", edges=edges)[1]))
+    assert ply["vertex"]["vx"].tolist() == [-6.0, -10.0]
+    assert [list(edge) for edge in ply["edge"].data] == [[0, 1]]
+
+
 def test_a_run_of_another_pytree_is_a_dataset_by_its_paths():
     def fall(t, y, args):
         return {"height": y["speed"], "speed": -9.81 + 0 * y["speed"]}
@@ -77,9 +115,12 @@ def test_a_run_of_another_pytree_is_a_dataset_by_its_paths():
         batch.to_xarray()
 
 
-def test_what_cannot_be_written_is_said(tmp_path):
-    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, \.ply, \.nc, got 'run\.usd'"):
+def test_what_cannot_be_written_is_said(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(RuntimeError, match=r"jeuler\[io\]"):
         jeuler.export(run(), tmp_path / "run.usd")
+    with pytest.raises(ValueError, match=r"\.npz, \.xyz, \.vtk, \.ply, \.nc, \.usd, \.usda, \.usdc, got 'run\.obj'"):
+        jeuler.export(run(), tmp_path / "run.obj")
     with pytest.raises(ValueError, match="edges"):
         jeuler.export(run(), tmp_path / "run.vtk", edges=[[0, 3]])
     single = jeuler.simulate(Scene(), ParticleState(jnp.zeros((1, 1)), jnp.zeros((1, 1))), dt=0.1, num_steps=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,8 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler.particles.state import ParticleState, check_run, in_space
 from jeuler.solving.dataset import to_dataset
 
+CODES_A_SECOND = 24  # time codes of a file for films
+
 
 @says_what_to_write()
 def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
@@ -21,16 +22,19 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
     ".npz" holds the times and each field of the state, as NumPy reads them. ".xyz" is one file of all saved times in
     extended XYZ, for OVITO. ".vtk" is one file for each saved time, run_0000.vtk and so on, for ParaView: particles
     as points, edges as lines. ".ply" is the same in the Stanford format, with colours where the state has them. In
-    .xyz, .vtk and .ply the dead are left out, and what lies on a line or in a plane has 0 as the other coordinates.
-    ".nc" is NetCDF 3, the dataset of ``solution.to_xarray()``.
+    .xyz, .vtk, .ply and .usd the dead are left out; what lies on a line or in a plane has 0 as the other coordinates.
+    ".nc" is NetCDF 3, the dataset of ``solution.to_xarray()``. ".usd", ".usda" and ".usdc" are one file of all saved
+    times for Blender, Omniverse and Houdini: points with velocities, numbers, and the state's size, color and opacity,
+    edges as curves, 24 time codes a second (extra io).
 
     Args:
       solution: what `simulate` returned, its ``.y`` a `ParticleState` with leading axis saved.
       path: where to; its folder must be there.
-      edges: pairs of particles drawn as lines, integers (edge, 2), such as ``springs.edges``; for .vtk and .ply. One
-        with a dead end is left out.
+      edges: pairs of particles drawn as lines, integers (edge, 2), such as ``springs.edges``; for .vtk, .ply and
+        .usd. One with a dead end is left out.
     Returns: the paths that were written, in the order of time.
-    Raises: ValueError, if the solution holds no states, or the path ends otherwise.
+    Raises: ValueError, if the solution holds no states, or the path ends otherwise; RuntimeError, for ".usd" without
+      usd-core.
     Example:
       >>> import os, tempfile, jax.numpy as jnp, numpy as np, jeuler
       >>> state = jeuler.ParticleState(jnp.zeros((3, 2)), jnp.ones((3, 2)))
@@ -43,6 +47,7 @@ def export(solution: Any, path: Any, *, edges: Any = ()) -> list[pathlib.Path]:
     path = pathlib.Path(path)
     check_run("export", solution)
     writers = {".npz": _write_npz, ".xyz": _write_xyz, ".vtk": _write_vtk, ".ply": _write_ply, ".nc": _write_nc}
+    writers |= dict.fromkeys((".usd", ".usda", ".usdc"), _write_usd)
     if path.suffix not in writers:
         raise ValueError(f"export writes {', '.join(writers)}, got {path.name!r}; give the path one of these ends")
     pairs = np.asarray(edges, int).reshape(-1, 2) if len(edges) else np.zeros((0, 2), int)
@@ -91,10 +96,15 @@ def _write_vtk(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pat
         here, x, v = _living(solution.y, n)
         own = path.with_name(f"{path.stem}_{n:04d}{path.suffix}")
         with own.open("w", encoding="utf-8") as file:
-            file.write(f"# vtk DataFile Version 3.0\nt = {t:.9g} s\nASCII\nDATASET POLYDATA\nPOINTS {len(x)} double\n")
+            file.write(
+                f"# vtk DataFile Version 3.0\nt = {t:.9g} s\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {len(x)} double\n"
+            )
             np.savetxt(file, x, fmt="%.9g")
-            _write_cells(file, "VERTICES", np.arange(len(x))[:, None])
-            _write_cells(file, "LINES", _lines(here, pairs))
+            lines = _lines(here, pairs)
+            file.write(f"CELLS {len(x) + len(lines)} {2 * len(x) + 3 * len(lines)}\n")
+            np.savetxt(file, np.column_stack([np.ones(len(x), int), np.arange(len(x))]), fmt="%d")
+            np.savetxt(file, np.column_stack([np.full(len(lines), 2), lines]), fmt="%d")
+            file.write(f"CELL_TYPES {len(x) + len(lines)}\n" + "1\n" * len(x) + "3\n" * len(lines))
             file.write(f"POINT_DATA {len(x)}\nVECTORS velocity double\n")
             np.savetxt(file, v, fmt="%.9g")
         written.append(own)
@@ -125,9 +135,47 @@ def _write_ply(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pat
     return written
 
 
-def _write_cells(file: Any, kind: str, cells: np.ndarray | Sequence[Any]) -> None:
-    cells = np.asarray(cells)
-    if len(cells):
-        count, corners = cells.shape
-        file.write(f"{kind} {count} {count * (corners + 1)}\n")
-        np.savetxt(file, np.column_stack([np.full(count, corners), cells]), fmt="%d")
+def _write_usd(solution: Any, path: pathlib.Path, pairs: np.ndarray) -> list[pathlib.Path]:
+    """By the library that owns the format, https://openusd.org/release/api/class_usd_geom_points.html."""
+    try:
+        from pxr import Usd, UsdGeom, Vt
+    except ImportError:
+        raise RuntimeError("export to .usd needs usd-core, which is not installed; pip install 'jeuler[io]'") from None
+    stage = Usd.Stage.CreateInMemory()
+    stage.SetTimeCodesPerSecond(CODES_A_SECOND)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, "/run")
+    stage.SetDefaultPrim(root.GetPrim())
+    points, curves = UsdGeom.Points.Define(stage, "/run/particles"), None
+    if len(pairs):
+        curves = UsdGeom.BasisCurves.Define(stage, "/run/edges")
+        curves.CreateTypeAttr(UsdGeom.Tokens.linear)
+    codes = CODES_A_SECOND * np.asarray(solution.t, float)
+    stage.SetStartTimeCode(codes.min())
+    stage.SetEndTimeCode(codes.max())
+    for n, code in enumerate(codes):
+        here, x, v = _living(solution.y, n)
+
+        def of(name, n=n, here=here):
+            value = getattr(solution.y, name)
+            return None if value is None else np.asarray(value[n], np.float32)[here]
+
+        size, color, opacity = map(of, ("size", "color", "opacity"))
+        x = Vt.Vec3fArray.FromNumpy(np.asarray(x, np.float32))
+        points.CreatePointsAttr().Set(x, code)
+        points.CreateVelocitiesAttr().Set(Vt.Vec3fArray.FromNumpy(np.asarray(v, np.float32)), code)
+        points.CreateIdsAttr().Set(Vt.Int64Array.FromNumpy(np.flatnonzero(here).astype(np.int64)), code)
+        if size is not None:
+            points.CreateWidthsAttr().Set(Vt.FloatArray.FromNumpy(size), code)
+        if color is not None:
+            points.CreateDisplayColorPrimvar("vertex").Set(Vt.Vec3fArray.FromNumpy(color), code)
+        if opacity is not None:
+            points.CreateDisplayOpacityPrimvar("vertex").Set(Vt.FloatArray.FromNumpy(opacity), code)
+        if curves is not None:
+            ends = np.asarray(x)[_lines(here, pairs).ravel()]
+            curves.CreatePointsAttr().Set(Vt.Vec3fArray.FromNumpy(ends), code)
+            curves.CreateCurveVertexCountsAttr().Set(Vt.IntArray([2] * (len(ends) // 2)), code)
+    if not stage.GetRootLayer().Export(str(path)):
+        raise OSError(f"{path} could not be written; its folder must be there and open to writing")
+    return [path]
