@@ -1,9 +1,11 @@
 """One cloth over eight devices that JAX makes of this machine's cores, beside the same on one.
 
 python benchmarks/divided.py cloth 512 [STEPS]        forward and gradient: differences, bytes sent, seconds
+python benchmarks/divided.py fine 512 [STEPS]         rest lengths of 1 mm, which cancel in float32: both beside float64
 python benchmarks/divided.py scaling 64               weak and strong scaling over 1 to 8 devices, of forward runs
 """
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -17,31 +19,47 @@ import jeuler
 from jeuler.scenes.shapes import Body, rows
 
 
-def sheet(long: int, wide: int) -> Body:
-    """A level sheet of long x wide particles, 1 m wide, joined along its threads and across its meshes."""
+def sheet(long: int, wide: int, apart: float) -> Body:
+    """A level sheet of long x wide particles, so far apart, joined along its threads and across its meshes."""
     g = np.arange(long * wide).reshape(long, wide)
-    x, y = np.meshgrid(*[np.arange(n) / (wide - 1) - n / wide / 2 for n in (long, wide)], indexing="ij")
+    x, y = np.meshgrid(*[apart * (np.arange(n) - n / 2) for n in (long, wide)], indexing="ij")
     edges = [rows(g[:-1], g[1:]), rows(g[:, :-1], g[:, 1:]), rows(g[:-1, :-1], g[1:, 1:]), rows(g[:-1, 1:], g[1:, :-1])]
     lines = [rows(g[:-2], g[1:-1], g[2:]), rows(g[:, :-2], g[:, 1:-1], g[:, 2:])]
     place = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
     return Body(place, np.concatenate(edges), np.zeros((0, 3), int), np.concatenate(lines))
 
 
-def problem(long: int, wide: int, num_steps: int, mesh=None):
+@dataclasses.dataclass
+class Cloth:
+    apart: float  # m
+    mass: float = 0.1
+    kd: float = 0.1
+    bending: float = 1e-4
+    drag: float = 0.01
+    dt: float = 1e-3
+    ball: tuple[float, float, float] = (0.0, 0.0, -0.4)
+
+
+FINE = Cloth(1e-3, 1e-3, 1e-3, 1e-9, 1e-4, 1e-4, (-0.056, -0.056, -0.1))
+
+
+def problem(long: int, wide: int, num_steps: int, mesh=None, dtype=jnp.float32, of: Cloth | None = None):
     """The scene and state, and the function of (ks, position) that runs it."""
-    body, noise = sheet(long, wide), np.random.default_rng(0)
-    x = jnp.asarray(body.position + 0.01 / wide * noise.normal(size=body.position.shape), jnp.float32)
-    mass = jnp.full(len(x), 0.1, jnp.float32).at[0].set(jnp.inf)
+    of = of or Cloth(1 / (wide - 1))
+    body, noise = sheet(long, wide, of.apart), np.random.default_rng(0)
+    x = jnp.asarray(body.position + 0.01 * of.apart * noise.normal(size=body.position.shape), dtype)
+    mass = jnp.full(len(x), of.mass, dtype).at[0].set(jnp.inf)
     state = jeuler.ParticleState(x, jnp.zeros_like(x), mass=mass)
-    ks = jnp.full(len(body.edges), 20.0, jnp.float32)
+    ks = jnp.full(len(body.edges), 20.0, dtype)
 
     def scene(ks):
-        ball = jeuler.PenaltyContact(jeuler.Sphere([0.0, 0.0, -0.4], 0.395), ks=10.0)
-        links = jeuler.Springs(body.edges, ks, 0.1, body.length), jeuler.Bending(body.lines, 1e-4)
-        return jeuler.Scene((*links, jeuler.Gravity([0.0, 0.0, -9.8]), jeuler.LinearDrag(0.01), ball))
+        radius = -of.ball[2] - of.apart / 10 if of is FINE else 0.395
+        ball = jeuler.PenaltyContact(jeuler.Sphere(list(of.ball), radius), ks=10.0)
+        links = jeuler.Springs(body.edges, ks, of.kd, body.length), jeuler.Bending(body.lines, of.bending)
+        return jeuler.Scene((*links, jeuler.Gravity([0.0, 0.0, -9.8]), jeuler.LinearDrag(of.drag), ball))
 
     def end(ks, x):
-        how = {"dt": 1e-3, "num_steps": num_steps, "save_every": num_steps, "step": jeuler.symplectic_euler_step}
+        how = {"dt": of.dt, "num_steps": num_steps, "save_every": num_steps, "step": jeuler.symplectic_euler_step}
         y = jeuler.simulate(scene(ks), state.replace(position=x), **how, mesh=mesh).y.position[-1]
         return jnp.sum(y**2), y
 
@@ -71,6 +89,26 @@ def cloth(side: int, num_steps: int = 10) -> None:
     print(f"on paper: {2 * side * 7 * 2 * 6 * 4:,} bytes")
 
 
+def fine(side: int, num_steps: int = 10) -> None:
+    jax.config.update("jax_enable_x64", True)
+    found = {}
+    for dtype in (jnp.float64, jnp.float32):
+        for name, mesh in (("undivided", None), ("divided", jax.make_mesh((8,), ("device",)))):
+            _, state, ks, end = problem(side, side, num_steps, mesh, dtype, FINE)
+            (_, y), gradient = jax.jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))(ks, state.position)
+            found[f"{name} {dtype.__name__}"] = [np.asarray(one, float) for one in (y, *gradient)]
+    pairs = (
+        ("divided float32", "undivided float32"),
+        ("divided float32", "undivided float64"),
+        ("undivided float32", "undivided float64"),
+        ("divided float64", "undivided float64"),
+    )
+    for pair in pairs:
+        a, b = (found[name] for name in pair)
+        off = [f"{np.abs(x - y).max() / np.abs(y).max():.1e}" for x, y in zip(a, b, strict=True)]
+        print(f"{' - '.join(pair):42s} positions {off[0]}, by ks {off[1]}, by position {off[2]}")
+
+
 def scaling(rows_each: int) -> None:
     for devices in (1, 2, 4, 8):
         flags = f"--xla_force_host_platform_device_count={devices}"
@@ -80,7 +118,7 @@ def scaling(rows_each: int) -> None:
 
 
 def on(kind: str, devices: str, long: str) -> None:
-    wide, num_steps = 256, 20
+    wide, num_steps = 128, 20
     mesh = jax.make_mesh((int(devices),), ("device",))
     scene, state, ks, end = problem(int(long), wide, num_steps, mesh)
     function = jax.jit(lambda *given: end(*given)[1])
@@ -96,10 +134,10 @@ def on(kind: str, devices: str, long: str) -> None:
 
 if __name__ == "__main__":
     task, *rest = sys.argv[1:]
-    if task == "cloth" and "force_host" not in os.environ.get("XLA_FLAGS", ""):
+    if task in ("cloth", "fine") and "force_host" not in os.environ.get("XLA_FLAGS", ""):
         flags = "--xla_force_host_platform_device_count=8"
         sys.exit(subprocess.run([sys.executable, *sys.argv], env=os.environ | {"XLA_FLAGS": flags}).returncode)
     if task == "on":
         on(*rest)
     else:
-        {"cloth": cloth, "scaling": scaling}[task](*map(int, rest))
+        {"cloth": cloth, "fine": fine, "scaling": scaling}[task](*map(int, rest))

@@ -1,6 +1,7 @@
 """Run by test_divided.py in a process with eight devices: one scene divided over them, beside the same undivided."""
 
 import re
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,12 @@ mass = np.where(np.arange(PARTICLES) == place[0], np.inf, rng.uniform(0.1, 0.2, 
 mesh = jax.make_mesh((8,), ("device",))
 
 
-def scene(ks, drag):
+state = jeuler.ParticleState(position, 0 * position, mass, color=np.ones((PARTICLES, 3)))
+hands = jeuler.PrescribedMotion(place[[0, 20]], lambda t: jnp.array([[0.0, 0.0], [1.8, 0.1]]) + jnp.sin(5 * t) / 10)
+floor = jeuler.Collisions((jeuler.Plane([0.0, -0.08], [0.0, 1.0]),), radius=jnp.full(PARTICLES, 0.02), restitution=0.3)
+
+
+def scene(ks, drag, effects=()):
     forces = (
         jeuler.Springs(chain, ks, 0.05, 0.1),
         jeuler.Bending(triples, 0.01),
@@ -28,74 +34,76 @@ def scene(ks, drag):
         jeuler.LinearDrag(drag),
         jeuler.PenaltyContact(jeuler.Sphere([2.0, -0.6], 0.5), ks=30.0, radius=jnp.full(PARTICLES, 0.1)),
     )
-    return jeuler.Scene(forces)
+    return jeuler.Scene(forces, effects)
 
 
-def ends(step, dtype, **how):
-    def of(ks, drag, x):
-        state = jeuler.ParticleState(x, jnp.zeros_like(x), mass, color=jnp.ones((PARTICLES, 3), dtype))
-        run = jeuler.simulate(scene(ks, drag), state, dt=0.01, num_steps=20, save_every=10, step=step, **how)
-        return jnp.sum(run.y.position[-1] ** 2), run
-
-    return of
+def run(given, num_steps=20, effects=(), **how):
+    ks, drag, x = given
+    start = state.replace(position=x, velocity=0 * x, color=state.color.astype(x.dtype))
+    how = {"save_every": 10, "step": jeuler.symplectic_euler_step, **how}
+    return jeuler.simulate(scene(ks, drag, effects), start, dt=0.01, num_steps=num_steps, **how)
 
 
 def same(found, expected, tolerance, name):
     assert jax.tree.structure(found) == jax.tree.structure(expected), name
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        a, b = np.asarray(a), np.asarray(b)
         assert a.shape == b.shape, name
         assert a.dtype == b.dtype, name
-        a, b = np.asarray(a), np.asarray(b)
         most = np.abs(b[np.isfinite(b)]).max(initial=1)
         np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * most, err_msg=name)
+    print(name)
 
 
-def given(dtype):
+def parameters(dtype):
     return np.asarray(rng.uniform(20, 30, len(chain)), dtype), np.full(PARTICLES, 0.1, dtype), position.astype(dtype)
 
 
-def with_gradient(**how):
-    run = ends(jeuler.symplectic_euler_step, np.float32, **how)
-    return jax.jit(jax.value_and_grad(run, argnums=(0, 1, 2), has_aux=True))
+single, double = parameters(np.float32), parameters(np.float64)
 
 
-single, double = given(np.float32), given(np.float64)
-same(with_gradient(mesh=mesh)(*single), with_gradient()(*single), 1e-5, "gradient")
-print("gradient")
+def gradients(**how):
+    def end(ks, *others):
+        found = run((ks, *others), num_steps=10, checkpoint=5, **how)
+        return jnp.sum(found.y.position[-1] ** 2), found
 
-text = jax.jit(ends(jeuler.euler_step, np.float64, mesh=mesh)).lower(*double).compile().as_text()
+    batch = np.stack([single[0], 2 * single[0]])
+    each = jax.vmap(jax.value_and_grad(end, argnums=(0, 1, 2), has_aux=True), (0, None, None))
+    return jax.jit(each)(batch, *single[1:])
+
+
+same(gradients(mesh=mesh), gradients(), 1e-5, "gradients of a batch")
+
+text = jax.jit(lambda *given: run(given, mesh=mesh)).lower(*double).compile().as_text()
 sent = sum(  # of each message, its numbers and its pairs of devices
     int(numbers) * int(two_dim) * len(re.findall(r"\{\d+,\d+\}", pairs)) * 8
     for numbers, two_dim, pairs in re.findall(
         r"= f64\[(\d+),(\d+)\]\S* collective-permute(?:-start)?\(.*source_target_pairs=\{(\S*)\}", text
     )
 )
-state = jeuler.ParticleState(position, 0 * position, mass)
 division = jeuler.divide(scene(*double[:2]), state, devices=8)
 assert sent == division.bytes_sent > 0, (sent, division)
 print("bytes", sent)
 
-how = {"compensated": True, "checkpoint": "sqrt"}
-found = ends(jeuler.heun_step, np.float64, mesh=mesh, **how)(*double)[1]
-same(found, ends(jeuler.heun_step, np.float64, **how)(*double)[1], 1e-12, "not jitted")
-print("not jitted")
+broken = double[0].copy(), *double[1:]
+broken[0][3] = 1e200
+how = {"step": jeuler.heun_step, "compensated": True, "save": lambda t, y: (y.position.mean(0) + t, y)}
+undivided, divided = ([run(given, **how, **over) for given in (double, broken)] for over in ({}, {"mesh": mesh}))
+same(divided[0], undivided[0], 1e-12, "not jitted")
+assert divided[1].first_nonfinite == undivided[1].first_nonfinite > 0
 
-batch = np.stack([double[0], 2 * double[0]])
-run, divided = (jax.vmap(ends(jeuler.euler_step, np.float64, **how), (0, None, None)) for how in ({}, {"mesh": mesh}))
-same(divided(batch, *double[1:]), run(batch, *double[1:]), 1e-12, "vmap")
-print("vmap")
-
-broken = double[0].copy()
-broken[3] = 1e200
-found = ends(jeuler.euler_step, np.float64, mesh=mesh)(broken, *double[1:])[1].first_nonfinite
-assert found == ends(jeuler.euler_step, np.float64)(broken, *double[1:])[1].first_nonfinite > 0
-expected = ends(jeuler.euler_step, np.float64)(*double)[1]
-expected = expected.y.position.mean(1) + expected.t[:, None]
-np.testing.assert_allclose(
-    jeuler.simulate(
-        scene(*double[:2]), state, dt=0.01, num_steps=20, save_every=10, mesh=mesh,
-        save=lambda t, state: state.position.mean(0) + t,
-    ).y,
-    expected, rtol=1e-12,
-)  # fmt: skip
-print("saved")
+folder = sys.argv[1]
+jax.config.update("jax_compilation_cache_dir", f"{folder}/programs")  # calls that go on have the same program
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+effects = hands, floor
+for name, steps in (("whole", 20), ("parts", 10), ("parts", 20)):
+    found = run(double, steps, effects, mesh=mesh, resume=f"{folder}/{name}", checkpoint_every=10)
+    frames = jax.tree.map(np.asarray, (found.t, found.y))
+    if name == "whole":
+        plain = run(double, steps, effects)
+        same(frames, (plain.t, plain.y), 1e-9, "effects")
+        same(int(found.unresolved_contacts), int(plain.unresolved_contacts), 0, "unresolved")
+        whole = frames
+same(frames, whole, 0, "gone on")
+heights = frames[1].position[1:, place[1:], 1]
+assert -0.0601 < heights.min() < -0.059  # on the floor

@@ -14,8 +14,8 @@ from jeuler.graphs.partition import partition
 from jeuler.scenes.shapes import square_cloth
 
 
-def test_a_divided_run_equals_the_undivided_one_and_sends_its_halo():
-    assert len(printed_by(Path(__file__).with_name("on_devices.py"))) == 5
+def test_a_divided_run_equals_the_undivided_one_sends_its_halo_and_goes_on_from_a_folder(tmp_path):
+    assert len(printed_by(Path(__file__).with_name("on_devices.py"), tmp_path)) == 6
 
 
 def some_groups(kind, rng):
@@ -84,14 +84,12 @@ SPRING = jeuler.Springs([[0, 1]], 1.0, 0.0, 1.0)
         ((lambda t, x, v, m: 0 * x,), (), PAIR, {}, "mesh must be None with <lambda>, which may act on any particles"),
         ((jeuler.AppliedForce(jnp.zeros(2)),), (), PAIR, {}, "mesh must be None with AppliedForce"),
         ((), (jeuler.SpeedLimit(1.0),), PAIR, {}, "mesh must be None with SpeedLimit"),
-        ((), (jeuler.Collisions(pairs=[(0, 1)]),), PAIR, {}, "mesh must be None with Collisions"),
+        ((), (jeuler.Collisions(pairs=[(0, 1)]),), PAIR, {}, "mesh must be None with Collisions of pairs"),
         ((jeuler.Springs([[0, 1]], lambda t: t * jnp.ones(1), 0.0, 1.0),), (), PAIR, {}, "Springs.ks that is a function"),
         ((SPRING,), (), PAIR.replace(alive=jnp.ones(2, bool)), {}, "mesh must be None with state.alive"),
         ((SPRING,), (), PAIR.replace(heat=jnp.ones(2)), {}, "mesh must be None with state.heat"),
         ((SPRING,), (), PAIR, {"step": jeuler.implicit_euler_step}, "step must be explicit with mesh"),
         ((SPRING,), (), PAIR, {"checkpoint": "reversible"}, 'checkpoint must not be "reversible" with mesh'),
-        ((SPRING,), (), PAIR, {"progress": True}, "progress must not be given with mesh"),
-        ((SPRING,), (), PAIR, {"resume": "run"}, "resume must not be given with mesh"),
         ((SPRING,), (), PAIR, {"windows": "auto"}, "windows must not be given with mesh"),
         ((SPRING,), (), PAIR, {"mesh": 8}, "mesh must be a jax.sharding.Mesh, got 8"),
     ],
@@ -100,3 +98,11 @@ def test_what_cannot_be_divided_is_refused_before_tracing(forces, effects, state
     how = {"mesh": jax.make_mesh((1,), ("device",)), **how}
     with pytest.raises(ValueError, match=message):
         jeuler.simulate(jeuler.Scene(forces, effects), state, dt=0.1, num_steps=1, **how)
+
+
+def test_a_divided_run_shows_how_far_it_is():
+    told = []
+    how = {"dt": 0.1, "num_steps": 4, "mesh": jax.make_mesh((1,), ("device",))}
+    run = jeuler.simulate(jeuler.Scene((SPRING,)), PAIR, **how, progress=lambda *so_far: told.append(so_far))
+    np.testing.assert_array_equal(run.y.position, jeuler.simulate(jeuler.Scene((SPRING,)), PAIR, **how).y.position)
+    assert told[-1] == (4, 4)

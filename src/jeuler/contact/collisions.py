@@ -72,6 +72,7 @@ class Collisions:
     capacity: int | None = None
 
     needs: ClassVar[tuple[str, ...]] = ("forward time", "prescribed pinned", "the solve")
+    axis: ClassVar[str | None] = None  # of the devices that share the particles
 
     def __post_init__(self) -> None:
         if not isinstance(self.colliders, (tuple, list)):
@@ -92,7 +93,8 @@ class Collisions:
         store_as_float(self, "radius", "restitution", "friction")
         for name, most in (("radius", np.inf), ("restitution", 1.0), ("friction", np.inf)):
             value = getattr(self, name)
-            if not checks.is_traced(value) and not bool(jnp.all((value >= 0) & (value <= most))):
+            # by NumPy, as jax.numpy is traced where the scene is made inside of jit
+            if not checks.is_traced(value) and not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= most)):
                 raise ValueError(f"Collisions.{name} must be from 0 to {most}, got {checks.shown(value.tolist())}")
         for name in ("radius", "friction"):
             checks.finite(f"Collisions.{name}", getattr(self, name))

@@ -71,16 +71,17 @@ class Contacts:
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
         self.resting: Array | bool = False  # (contact,), which are held from the start of the step
+        self.axis: str | None = getattr(collisions, "axis", None)  # of the devices that share the particles
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        sizes = ("particles", "dim", "row")
-        names = tuple(name for name in vars(self) if name not in sizes)
-        return tuple(getattr(self, name) for name in names), (names, self.particles, self.dim, self.row)
+        fixed = ("particles", "dim", "row", "axis")
+        names = tuple(name for name in vars(self) if name not in fixed)
+        return tuple(getattr(self, name) for name in names), (names, *(getattr(self, name) for name in fixed))
 
     @classmethod
     def tree_unflatten(cls, kept: tuple[Any, ...], values: tuple[Any, ...]) -> Contacts:
         self = object.__new__(cls)
-        names, self.particles, self.dim, self.row = kept
+        names, self.particles, self.dim, self.row, self.axis = kept
         vars(self).update(zip(names, values, strict=True))
         return self
 
@@ -101,6 +102,15 @@ class Contacts:
     def many(self) -> bool:
         """Whether there are so many pairs that what rests together is solved for by iterations alone."""
         return len(self.i) * (self.dim + 1) > DENSE_UP_TO
+
+    def largest(self, x: Array) -> Array:
+        """The largest of x, at least 0, on all devices that share the particles. Not in a loop, where these part."""
+        most = jnp.max(jax.lax.stop_gradient(x), initial=0)
+        return most if self.axis is None else jax.lax.pmax(most, self.axis)
+
+    def total(self, x: Array) -> Array:
+        """The sum of x, likewise."""
+        return jnp.sum(x) if self.axis is None else jax.lax.psum(jnp.sum(x), self.axis)
 
     def open(self, slow: Array) -> Array:
         """Up to which gap, (contact,), m, a contact that is slow rests; slow: an approach that is none, m a step.
@@ -311,6 +321,9 @@ class Chosen(NamedTuple):
     @property
     def many(self) -> bool:
         return True
+
+    def largest(self, x: Array) -> Array:
+        return jnp.max(jax.lax.stop_gradient(x), initial=0)
 
     def close(self, active: Array, gap: Array) -> Array:
         return self.listed

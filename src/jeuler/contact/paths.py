@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -55,20 +56,23 @@ def along(y: Array, support: Array) -> Array:
     return jnp.sum(y * unit(support), axis=-1)
 
 
-def share_of_the_force(x: Array, displacement: Array, v: Array, dv: Array, dt: Any) -> Array:
+def share_of_the_force(
+    x: Array, displacement: Array, v: Array, dv: Array, dt: Any, total: Callable[[Array], Array] = jnp.sum
+) -> Array:
     """Theta, (particle, 1): how much of dt dv the displacement of the step holds, to the nearest half.
 
         d = dt v + theta dt dv:   0 explicit Euler, 1 symplectic and implicit Euler, 1/2 Heun, Runge-Kutta, leapfrog
 
     A contact force that acts through the whole step moves a particle by as much of its own impulse. Where dv is within
     rounding, as in equilibrium, it is that of the others, weighted by dv^2; 1/2 where there are none.
+    ``total`` sums over all particles.
     """
     along = jnp.sum((displacement - dt * v) * dv, axis=-1, keepdims=True)
     most = dt * jnp.sum(dv * dv, axis=-1, keepdims=True)
     size = jnp.max(jnp.abs(x) + jnp.abs(displacement), axis=-1, keepdims=True)
     clear = dt * most > (16 * jnp.finfo(x.dtype).eps * size) ** 2
     along, most = jnp.where(clear, along, 0), jnp.where(clear, most, 0)
-    total = jnp.sum(most)
-    others = jnp.where(total > 0, jnp.sum(along) / jnp.where(total > 0, total, 1), 0.5)
+    of_all = total(most)
+    others = jnp.where(of_all > 0, total(along) / jnp.where(of_all > 0, of_all, 1), 0.5)
     part = jnp.where(clear, along / jnp.where(clear, most, 1), others)
     return lax.stop_gradient(jnp.clip(jnp.round(2 * part) / 2, 0, 1))

@@ -58,6 +58,13 @@ class Problem(NamedTuple):
     theta: Array  # (particle, 1), share of a kick that moves the particle in this step
     active: Array  # (contact,), who touches
     clear: Array  # (contact,), gap at the start, over dt, m/s: what does not touch is not to be pushed into either
+    fastest: Array  # (), the largest speed of all these velocities, m/s
+
+    @classmethod
+    def of(cls, contacts: Contacts | Chosen, normal: Array, velocity: Array, *others: Array) -> Problem:
+        gap, theta, active, clear = others
+        fastest = contacts.largest(length(velocity))
+        return cls(contacts, normal, velocity, gap, theta, active, clear, fastest)
 
     def push(self, w: Array) -> Array:
         """The normal component of w, (contact,), m/s."""
@@ -78,8 +85,7 @@ class Problem(NamedTuple):
 
     def weak(self) -> Array:
         """A push, m/s, that may be a rounding, or what the iterations leave."""
-        speed = jnp.max(length(lax.stop_gradient(self.velocity)), initial=0)
-        return 100 * self.relative_tolerance() * speed
+        return 100 * self.relative_tolerance() * self.fastest
 
     def relative_tolerance(self) -> float:
         """How near to the fixed point the iterations come, in parts of the largest velocity of the problem."""
@@ -100,7 +106,7 @@ class Problem(NamedTuple):
         def of(y):
             return y.at[kept].get(mode="fill", fill_value=0)
 
-        own = Problem(
+        own = Problem.of(
             contacts, of(self.normal), of(self.velocity), of(self.gap), self.theta, of(self.active), of(self.clear)
         )
         return own, kept
@@ -161,7 +167,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
         stays = jnp.zeros_like(active)
         if load is not None:
-            loaded = problem._replace(velocity=load)
+            loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
             stays = (jnp.abs(problem.gap) <= small + problem.weak()) & pressing(loaded, small)
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
@@ -206,8 +212,8 @@ def together(problem: Problem, small: Array) -> tuple[Array, Array]:
 def _tolerated(problem: Problem) -> Array:
     """The velocity of a contact, m/s, that counts as none beside those of the problem."""
     speed = length(lax.stop_gradient(problem.velocity))
-    rounding = 64 * jnp.finfo(speed.dtype).eps * jnp.max(speed, initial=0)
-    return 1e-3 * jnp.max(jnp.where(problem.active, speed, 0), initial=0) + rounding
+    rounding = 64 * jnp.finfo(speed.dtype).eps * problem.fastest
+    return 1e-3 * problem.contacts.largest(jnp.where(problem.active, speed, 0)) + rounding
 
 
 def _iterate(problem: Problem, small: Array) -> tuple[Array, Array]:
@@ -234,8 +240,7 @@ def _impulses(problem: Problem, small: Array) -> tuple[Array, Array]:
 
 
 def _enough(problem: Problem, small: Array) -> Array:
-    fastest = jnp.max(length(problem.velocity), initial=0)
-    return problem.relative_tolerance() * fastest + 0.01 * jnp.min(small, initial=jnp.inf)
+    return problem.relative_tolerance() * problem.fastest + 0.01 * jnp.min(small, initial=jnp.inf)
 
 
 def _accelerated(

@@ -51,7 +51,7 @@ def _resolve(
     contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, load: Array | None
 ) -> tuple[Array, Array, Array]:
     displacement, dv = x_free - x, v_free - v
-    theta = share_of_the_force(x, displacement, v, dv, contacts.dt)
+    theta = share_of_the_force(x, displacement, v, dv, contacts.dt, contacts.total)
     contacts.near(free_path(x, displacement, dv, contacts.dt))
     slow = _slow(contacts, dv)
 
@@ -77,12 +77,13 @@ def settle(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tupl
 
     Changes of velocity and position, (particle, dim). They are not differentiated: the impacts are counted.
     """
+    contacts.axis = None  # other devices may have nothing to settle
     end = contacts.look(path, jnp.ones_like(contacts.both(jnp.add, path.s)))
     small = contacts.roundoff(path.x)
     touches = (end.gap <= small + contacts.open(slow)) & contacts.possible()
     speed = contacts.relative(velocity) + end.recession[:, None] * end.normal + contacts.landing(end.gap, end.normal)
     gap = end.gap / contacts.dt
-    problem = Problem(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
+    problem = Problem.of(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
     return together(problem, small)
 
 
@@ -105,7 +106,8 @@ def answer(contacts: Contacts, x: Array, v: Array, acceleration: Array) -> Calla
 
     def kick(u):
         velocity = contacts.relative(u) + recession[:, None] * normal + contacts.landing(gap, normal)
-        return at_rest(Problem(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0), small).kick
+        problem = Problem.of(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0)
+        return at_rest(problem, small).kick
 
     return kick
 
@@ -131,7 +133,7 @@ def hold(
     surface = recession[:, None] * normal + contacts.landing(gap, normal)
     end_speed = contacts.relative(v + dv) + surface
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
-    problem = Problem(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt)
+    problem = Problem.of(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt)
     if load is None:
         rest = at_rest(problem, small)
     else:

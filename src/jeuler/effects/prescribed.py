@@ -14,6 +14,7 @@ from jeuler._core.annotations import MovingParameter, Parameter, ParticleIndices
 from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import as_component, component, replace, store_as_float
 from jeuler._core.interpolate import interpolate, slopes, upsampled
+from jeuler.particles.strips import ON_PATHS
 
 
 @component()
@@ -162,3 +163,6 @@ class PrescribedMotion:
             came = type(form).__name__
             raise ValueError(f"PrescribedMotion.path(t) must be one array (prescribed, dim), got a {came}")
         checks.shape("PrescribedMotion.path(t)", shape, (len(indices), dim), meaning="(prescribed, dim)")
+
+
+ON_PATHS.add(PrescribedMotion)

@@ -18,7 +18,8 @@ from jeuler._jax import programs
 from jeuler._jax.haste import Haste
 from jeuler.contact.collisions import has_long_code
 from jeuler.graphs.partition import Partition
-from jeuler.particles.divided import check_division, run_divided
+from jeuler.particles.divided import check_division
+from jeuler.particles.divided_run import divided_loop, run_divided
 from jeuler.particles.equation import Equation
 from jeuler.particles.fields import START, acts, draws, name_of, needs, with_required_fields
 from jeuler.particles.protocols import Context
@@ -84,7 +85,8 @@ def simulate(
       checkpoint_every: steps between two states on disk, as in `solve`.
       mesh: a ``jax.sharding.Mesh``: the particles of this one scene are divided over all its devices, which send each
         other the positions and velocities of those at their borders at each evaluation of the forces; `divide` tells
-        which scenes can be divided, and what is sent. Explicit steps only; ``save`` is done at the end, on all frames.
+        which scenes can be divided, and what is sent. Explicit steps only; ``save`` is done at the end, on all frames,
+        but with ``resume`` or ``progress``.
     Returns: `Solution` whose ``.y`` is a `ParticleState` with leading axis saved, or what ``save`` returned.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -104,10 +106,16 @@ def simulate(
     checks.true_or_false("compensated", compensated)
     inputs = scene, state, grid, key, Function(step), Function(save)
     if mesh is not None:
-        how = {"windows": windows, "progress": progress, "resume": resume, "key": key}
+        how = {"windows": windows, "resume": resume, "key": key}
         parts = check_division(scene, state, mesh, step, checkpoint, how)
         divided = scene, state, grid, parts, Function(step), Function(save)
-        return programs.call(_simulate_divided, divided, (checkpoint, compensated, mesh))
+        if resume is None and not progress:
+            return programs.call(_simulate_divided, divided, (checkpoint, compensated, mesh))
+        way = _loop_on_devices, divided, (compensated, mesh), grid
+        if resume is not None:
+            return Solution(*run_on_disk(*way, resume, checkpoint_every, progress))
+        found = run_in_chunks(*way, progress)
+        return Solution(*(in_one_scan(_loop_on_devices(*divided, compensated, mesh)) if found is None else found))
     if not isinstance(windows, (str, tuple, list)):
         came = checks.shown(windows)
         raise ValueError(f'windows must be "auto" or a tuple of sizes, got {came}; write windows=({came},)')
@@ -149,9 +157,26 @@ def _simulate_divided(
         return in_one_scan(loop)[:3]
 
     t, y, first_nonfinite = run_divided(run, scene, state, grid, parts, mesh)
+    unresolved = jnp.int32(0) if y.unresolved_contacts is None else y.unresolved_contacts[-1]
     if saver.function is not None:
         y = jax.vmap(saver.function)(t, y)
-    return Solution(t, y, first_nonfinite, jnp.int32(0))
+    return Solution(t, y, first_nonfinite, unresolved)
+
+
+def _loop_on_devices(
+    scene: Scene,
+    state: ParticleState,
+    grid: Grid,
+    parts: Partition,
+    stepper: Function,
+    saver: Function,
+    compensated: bool,
+    mesh: Any,
+) -> Loop:
+    """The loop of `simulate` over the devices of a mesh, for a run that is kept or shows how far it is."""
+    check_save(saver.function)
+    _, state = first_step(scene, state, grid, stepper.function, None)
+    return divided_loop(scene, state, grid, parts, mesh, stepper.function, saver.function, compensated)
 
 
 def _loop(

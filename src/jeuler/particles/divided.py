@@ -9,60 +9,20 @@ always is, of a scene that has the device's own particles.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
-from jax import Array, lax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
 from jeuler._core import checks
-from jeuler._core.component import component, replace, result
+from jeuler._core.component import result
 from jeuler._core.in_time import at_time
-from jeuler.contact.penalty import PenaltyContact
-from jeuler.forces import (
-    Bending,
-    CubicSprings,
-    DryFriction,
-    Gravity,
-    LinearDrag,
-    PointAttractor,
-    QuadraticDrag,
-    Springs,
-    Strings,
-    Torsion,
-    Viscosity,
-)
+from jeuler.contact.collisions import Collisions
 from jeuler.graphs.partition import Partition, partition
 from jeuler.particles.fields import name_of
-from jeuler.particles.protocols import Context
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import DEFAULTS, ParticleState
-
-PyTree = Any
-STRIP = "strip"  # the axis of the mesh
-
-# What acts on each particle by itself, with those of its fields that may have one number a particle,
-ALONE: dict[type, tuple[str, ...]] = {
-    DryFriction: ("coefficient",),
-    Gravity: (),
-    LinearDrag: ("coefficient",),
-    PenaltyContact: ("radius",),
-    PointAttractor: (),
-    QuadraticDrag: ("coefficient",),
-}
-# and on groups of them, with the field that names these; all others are () or (group,).
-ON_GROUPS: dict[type, str] = {
-    Bending: "triples",
-    CubicSprings: "edges",
-    Springs: "edges",
-    Strings: "edges",
-    Torsion: "quads",
-    Viscosity: "edges",
-}
+from jeuler.particles.strips import ALONE, COUNTED, ON_GROUPS, ON_PATHS, acts_alone, groups_of, numbers_of
 
 
 @result
@@ -105,7 +65,8 @@ def divide(scene: Scene, state: ParticleState, *, devices: int) -> Division:
 
     Args:
       scene: forces on single particles (`Gravity`, drags, `PointAttractor`, `DryFriction`, `PenaltyContact`) and on
-        groups of them (`Springs`, `CubicSprings`, `Strings`, `Bending`, `Torsion`, `Viscosity`); no effects.
+        groups of them (`Springs`, `CubicSprings`, `Strings`, `Bending`, `Torsion`, `Viscosity`); the effects
+        `PrescribedMotion` and `Collisions` without pairs.
       state: the particles.
       devices: how many; a scene can be divided over more than there are here.
     Returns: `Division`; printed, it is one line.
@@ -132,12 +93,17 @@ def divide(scene: Scene, state: ParticleState, *, devices: int) -> Division:
 def check_divisible(scene: Scene, state: ParticleState) -> None:
     """One ValueError that names the first force, effect or field that cannot be divided."""
     for part in (*scene.forces, *scene.effects):
-        if type(part) not in (*ALONE, *ON_GROUPS):
-            able = ", ".join(sorted(kind.__name__ for kind in (*ALONE, *ON_GROUPS)))
+        if isinstance(part, Collisions) and part.pairs:
+            raise ValueError(
+                f"mesh must be None with Collisions of pairs, which may be on any two devices, got pairs="
+                f"{checks.shown(part.pairs)}; what can be divided is Collisions of particles with colliders"
+            )
+        if not acts_alone(part) and type(part) not in ON_GROUPS:
+            able = ", ".join(sorted(kind.__name__ for kind in (*ALONE, *ON_PATHS, *ON_GROUPS)))
             raise ValueError(
                 f"mesh must be None with {name_of(part)}, which may act on any particles; what can be divided is {able}"
             )
-        for name in _numbers_of(part) if type(part) in ON_GROUPS else ():
+        for name in numbers_of(part) if type(part) in ON_GROUPS else ():
             value = getattr(part, name)
             if callable(value) and checks.form_of(name, at_time, value, 0.0).shape != ():
                 raise ValueError(
@@ -145,7 +111,7 @@ def check_divisible(scene: Scene, state: ParticleState) -> None:
                     f"got one; give one number for all, or numbers that stay"
                 )
     for name in state.fields():
-        if name not in ("position", "velocity", "mass", *DEFAULTS) or name == "alive":
+        if name not in ("position", "velocity", "mass", COUNTED, *DEFAULTS) or name == "alive":
             able = ", ".join(("position", "velocity", "mass", *sorted({*DEFAULTS} - {"alive"})))
             raise ValueError(f"mesh must be None with state.{name}; what can be divided is {able}")
 
@@ -158,8 +124,10 @@ def check_division(
         hint = 'write mesh=jax.make_mesh((jax.device_count(),), ("device",))'
         raise ValueError(f"mesh must be a jax.sharding.Mesh, got {checks.shown(mesh)}; {hint}")
     for name, value in how.items():
-        if value is not None and value is not False and value != ():
+        if name != "resume" and value is not None and value != ():
             raise ValueError(f"{name} must not be given with mesh, a run in one piece, got {checks.shown(value)}")
+    if how["resume"] is not None and jax.process_count() > 1:
+        raise ValueError("resume must not be given with mesh in several processes, none of which has the whole state")
     if checkpoint == "reversible":
         raise ValueError('checkpoint must not be "reversible" with mesh; take checkpoint="sqrt"')
     if not hasattr(step, "increment"):
@@ -169,138 +137,3 @@ def check_division(
         )
     check_divisible(scene, state)
     return partition(groups_of(scene), len(state.position), mesh.size)
-
-
-def groups_of(scene: Scene) -> tuple[Any, ...]:
-    """The arrays of groups of the forces that act on some."""
-    return tuple(getattr(force, ON_GROUPS[type(force)]) for force in _on_groups(scene))
-
-
-def _on_groups(scene: Scene) -> list[Any]:
-    return [force for force in scene.forces if type(force) in ON_GROUPS and len(getattr(force, ON_GROUPS[type(force)]))]
-
-
-def _numbers_of(part: Any) -> tuple[str, ...]:
-    """The fields that may have one number a particle, or a group."""
-    if type(part) in ALONE:
-        return ALONE[type(part)]
-    return tuple(field.name for field in dataclasses.fields(part) if field.name != ON_GROUPS[type(part)])
-
-
-def _own(part: Any, which: Any) -> dict[str, Array]:
-    """Those of its fields that have one number a particle, or a group, for ``which`` of these."""
-    named = {name: getattr(part, name) for name in _numbers_of(part)}
-    return {name: x[which] for name, x in named.items() if getattr(x, "ndim", 0)}
-
-
-def _without(part: Any, own: dict[str, Array], **changes: Any) -> Any:
-    """The part without these numbers, which `_with` puts in again."""
-    return replace(part, **dict.fromkeys(own, 0.0), **changes)
-
-
-def _of_copies(force: Any, own: dict[str, Array], rows: Array) -> Any:
-    """The force between copies of its particles, the first of all groups first, without its own numbers."""
-    _, k, count = rows.shape
-    return _without(force, own, **{ON_GROUPS[type(force)]: np.arange(k * count).reshape(k, count).T})
-
-
-@component(static=("hops", "strips"))
-class OnStrip:
-    """The forces on groups, of a device's own particles and ghosts: a force on its own particles.
-
-    Each force gets copies of the particles of its groups, and what it gives to these is added up.
-    """
-
-    hops: tuple[int, ...]
-    strips: int
-    forces: list[Any]
-    sends: list[Array]
-    rows: list[Array]
-    targets: list[Array]
-
-    def __call__(self, t: Any, position: Array, velocity: Array, mass: Array) -> Array:
-        motion = self.with_ghosts(jnp.concatenate([position, velocity], axis=1))
-        total, dim = jnp.zeros_like(position), position.shape[1]
-        for force, rows, target in zip(self.forces, self.rows, self.targets, strict=True):
-            copies = motion[rows.ravel()]
-            share = force(t, copies[:, :dim], copies[:, dim:], jnp.ones_like(copies[:, 0]))
-            total = total.at[target.ravel()].add(share, mode="drop")
-        return total
-
-    def with_ghosts(self, x: Array) -> Array:
-        """x of the own particles, (particle, n), and below it that of the ghosts."""
-        parts = [x]
-        for hop, rows in zip(self.hops, self.sends, strict=True):
-            path = [(p, p + hop) for p in range(self.strips) if 0 <= p + hop < self.strips]
-            parts.append(lax.ppermute(x[rows], STRIP, path))
-        return jnp.concatenate(parts)
-
-    def prepare(self, context: Context) -> OnStrip:
-        """With each force prepared for its copies."""
-
-        def prepared(force, rows):
-            own = dataclasses.replace(context, particles=rows.size)
-            return force.prepare(own) if hasattr(force, "prepare") else force
-
-        return replace(self, forces=[prepared(*each) for each in zip(self.forces, self.rows, strict=True)])
-
-
-Fields = tuple[Array, ParticleState, Array]  # t, y, first_nonfinite
-
-
-def run_divided(
-    run: Callable[..., Fields], scene: Scene, state: ParticleState, grid: Any, parts: Partition, mesh: Mesh
-) -> Fields:
-    """t, y and first_nonfinite of a `Solution`, where ``run(scene, state, grid)`` gives those of one device."""
-    particles, one_each = len(state.position), jnp.ndim(state.mass) > 0
-    alone = [part for part in scene.forces if type(part) in ALONE]
-    groups = _on_groups(scene)
-    state, order = _in_order(state, parts)
-    numbers = [_own(part, order) for part in alone]
-    strengths = [_own(force, which.ravel()) for force, which in zip(groups, parts.which, strict=True)]
-    alone = [_without(part, own) for part, own in zip(alone, numbers, strict=True)]
-    groups = [_of_copies(force, own, rows) for force, own, rows in zip(groups, strengths, parts.rows, strict=True)]
-
-    def on_device(of_device, tables, of_all):
-        (state, *of_parts), (*parts_of_all, grid) = of_device, of_all
-        alone, groups = (
-            [replace(part, **own) for part, own in zip(these, their_own, strict=True)]
-            for these, their_own in zip(parts_of_all, of_parts, strict=True)
-        )
-        tables = jax.tree.map(lambda x: x[0], tables)
-        on_groups = (OnStrip(parts.hops, parts.strips, groups, *tables),) if groups else ()
-        t, y, first_nonfinite = run(Scene((*alone, *on_groups)), state, grid)
-        return t, y, _first(first_nonfinite)
-
-    each, all_ = PartitionSpec(STRIP), PartitionSpec()
-    strips = Mesh(mesh.devices.ravel(), (STRIP,))
-    run_all = jax.shard_map(
-        on_device,
-        mesh=strips,
-        in_specs=(each, each, all_),
-        out_specs=(all_, PartitionSpec(None, STRIP), all_),
-        check_vma=False,
-    )
-    tables = [list(x) for x in (parts.sends, parts.rows, parts.targets)]
-    t, y, first_nonfinite = run_all((state, numbers, strengths), tables, (alone, groups, grid))
-    back = slice(particles) if parts.back is None else parts.back
-    y = jax.tree.map(lambda x: x[:, back], y)
-    return t, y if one_each else replace(y, mass=y.mass[:, 0]), first_nonfinite
-
-
-def _in_order(state: ParticleState, parts: Partition) -> tuple[ParticleState, Array]:
-    """The state in the order of the strips, filled up with copies of the last particle, pinned; and that order."""
-    particles = len(state.position)
-    place = jnp.arange(parts.strips * parts.size)
-    order = jnp.minimum(place, particles - 1)
-    order = order if parts.order is None else jnp.asarray(parts.order)[order]
-    mass = jnp.broadcast_to(state.mass, (particles,))
-    state = jax.tree.map(lambda x: x[order], replace(state, mass=mass))
-    return replace(state, mass=jnp.where(place < particles, state.mass, jnp.inf)), order
-
-
-def _first(first_nonfinite: Array) -> Array:
-    """The least over all devices of those that are not -1."""
-    never = jnp.iinfo(first_nonfinite.dtype).max
-    first = lax.pmin(jnp.where(first_nonfinite < 0, never, first_nonfinite), STRIP)
-    return jnp.where(first == never, -1, first)
