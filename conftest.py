@@ -4,6 +4,9 @@ import os
 import pathlib
 import re
 
+# Small matrices by one thread: two processes on two cores with two threads each wait for each other. Before NumPy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 from _pytest.doctest import DoctestItem

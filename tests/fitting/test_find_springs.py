@@ -88,6 +88,24 @@ def test_springs_of_rest_length_zero():
         assert (found.rest_length < 1e-3).all()
 
 
+@pytest.mark.parametrize("seed", [106, 219])
+def test_errors_of_the_integrals_are_no_spring(seed):
+    """Two runs of that setting with 10 balls by its leapfrog, in which they looked like one of 2e-5 N/m."""
+    draw, pairs = np.random.default_rng(seed), np.stack(np.triu_indices(10, 1), axis=1)
+    edges = pairs[draw.random(45) < 0.5]
+    velocity = draw.normal(size=(10, 2))
+    velocity *= 0.5 / np.linalg.norm(velocity, axis=1, keepdims=True)
+    x, ends, dt = 0.5 * draw.normal(size=(10, 2)), np.eye(10)[edges[:, 0]] - np.eye(10)[edges[:, 1]], 0.001
+    matrix = -0.1 * ends.T @ ends
+    velocity, seen = velocity + dt / 2 * matrix @ x, [x]
+    for n in range(1, 4801):
+        x = x + dt * velocity
+        velocity = velocity + dt * matrix @ x
+        seen += [x] if n % 100 == 0 else []
+    found = jeuler.find_springs(0.1 * np.arange(49), np.array(seen), mass=1.0, refine=False)
+    assert found.edges.tolist() == edges.tolist()
+
+
 def test_a_hidden_particle_gives_a_word(net):
     found = jeuler.find_springs(TIMES, net[0][:, [0, 2, 3, 4, 5, 6]], mass=1.0)
     assert not found.explained
@@ -118,11 +136,11 @@ def test_what_is_not_excited_is_named():
 def test_noise_alone_makes_no_springs():
     draw, false = np.random.default_rng(3), 0
     t = np.linspace(0, 1, 101)
-    for _ in range(20):
+    for _ in range(10):
         start, speed = draw.normal(size=(2, 6, 2))
         seen = start + speed * t[:, None, None] + 1e-3 * draw.normal(size=(101, 6, 2))
         false += len(jeuler.find_springs(t, seen, mass=1.0, refine=False).edges)
-    assert false <= 2
+    assert false <= 1
 
 
 def test_the_fit_of_the_whole_motion_refines(net):

@@ -16,7 +16,7 @@ from jeuler.fitting.observations import checked_observations, noise_of
 from jeuler.fitting.smooth import FEWEST
 
 MOST_PAIRS = 2500  # candidates that are looked at where none are given: all pairs of 71 particles
-LEAST_NOISE = 1e-6  # of the size of the motion: what the integrals of exact data are in error by
+LEAST_NOISE = 3e-6  # of the size of the motion: more than the integrals of exact data are in error by
 PASSES = 2  # the second with the noise that the springs of the first make of that of the positions
 
 

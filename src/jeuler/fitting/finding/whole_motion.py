@@ -20,6 +20,7 @@ MOST_PAIRS = 66  # all pairs of 12 particles
 DOUBT = 0.5  # of the usual stiffness: where that much could be hidden, the whole motion is asked
 ITERATIONS = 15
 FOLLOWS = 2.0  # times the noise
+ROUNDING = 1e-13  # added to a diagonal of ones, for columns that are the same
 
 
 def in_doubt(task: Tracked, found: Selection) -> bool:
@@ -70,16 +71,23 @@ class Closed:
         return cls(task.times - task.times[0], y, ends / root_mass, root_mass)
 
     def residual(self, ks: np.ndarray) -> np.ndarray:
-        """What is left of the tracks with the best initial positions and velocities."""
+        """What is left of the tracks with the best initial positions and velocities.
+
+        The products of two columns of the basis are those of their shapes times those of their functions of time, so
+        that the normal equations are small: the basis, as long as the tracks, is never made.
+        """
         squares, modes = np.linalg.eigh(self.ends.T @ (ks[:, None] * self.ends))
         omega = np.sqrt(np.maximum(squares, 0))[:, None]
-        shapes = modes / self.root_mass[:, None]
         sine = np.where(omega > 1e-9, np.sin(omega * self.times) / np.maximum(omega, 1e-9), self.times)
-        parts = [
-            np.einsum("ak,kt->tak", shapes, f).reshape(len(self.y), -1) for f in (np.cos(omega * self.times), sine)
-        ]
-        basis, _ = np.linalg.qr(np.concatenate(parts, axis=1))
-        return (self.y - basis @ (basis.T @ self.y)).ravel()
+        swing = np.concatenate([np.cos(omega * self.times), sine])  # (2 mode, time)
+        shapes = np.tile(modes / self.root_mass[:, None], 2)  # (particle, 2 mode)
+        gram = (shapes.T @ shapes) * (swing @ swing.T)
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        gram = gram / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+        y = self.y.reshape(len(self.times), len(self.root_mass), -1)
+        along = np.einsum("kt,tkd->kd", swing, np.einsum("ak,tad->tkd", shapes, y)) / scale[:, None]
+        amplitude = np.linalg.solve(gram, along) / scale[:, None]
+        return (y - np.einsum("ak,tkd->tad", shapes, swing.T[:, :, None] * amplitude)).ravel()
 
     def jacobian(self, ks: np.ndarray, r: np.ndarray, usual: float) -> np.ndarray:
         """By forward differences."""
@@ -93,13 +101,12 @@ class Closed:
         r, damping = self.residual(ks), 1e-4
         jacobian = self.jacobian(ks, r, usual)
         for _ in range(ITERATIONS):
-            scale = np.sqrt(damping) * np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-            rows = np.concatenate([jacobian, np.diag(scale)])
-            wanted = np.concatenate([jacobian @ ks - r, scale * ks])
-            corner = np.asarray(
-                np.linalg.qr(np.column_stack([rows, wanted]), mode="r")
-            )  # a small problem of the same answer
-            trial, _ = nnls(corner[:-1, :-1], corner[:-1, -1], maxiter=50 * len(ks))
+            scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+            across = jacobian / scale
+            gram = across.T @ across + damping * np.eye(len(ks))
+            root = np.linalg.cholesky(gram)  # |root^T z - shift|^2 is the sum of squares of the damped, linear problem
+            shift = np.linalg.solve(root, gram @ (scale * ks) - across.T @ r)
+            trial = nnls(root.T, shift, maxiter=50 * len(ks))[0] / scale
             new = self.residual(trial)
             gain = float(r @ r - new @ new)
             if gain <= 0:
