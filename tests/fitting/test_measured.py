@@ -7,6 +7,7 @@ import pytest
 
 import jeuler
 from jeuler import observing
+from jeuler.fitting.pages import page_of
 
 KS, KD = 30.0, 0.4
 SCENE = jeuler.Scene((jeuler.Springs([[0, 1]], ks=20.0, kd=0.1, rest_length=1.0),))
@@ -64,6 +65,12 @@ def test_recordings_of_different_sensors_lengths_and_rates_share_the_spring(rand
     assert len(found.state) == 3
     assert found.training_rms == pytest.approx(found.held_out_rms, rel=0.5)
     assert "held out" not in found.message
+    shown = page_of(found).shown  # unlike sensors share no axis of the report
+    assert [(each.quantity, each.unit, list(each.names), each.whose) for each in shown] == [
+        ("position", "m", ["x1"], "recordings 1, 2"),
+        ("acceleration", "m/s^2", ["ax1"], "recording 3"),
+    ]
+    np.testing.assert_array_equal(shown[1].observed[:, 0], np.ravel(recordings[2].values))
 
 
 def test_recordings_with_measured_inputs_of_their_own_give_spring_and_gain(random):

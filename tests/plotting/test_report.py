@@ -12,7 +12,7 @@ from PIL import Image
 
 import jeuler
 from jeuler.plotting import plot_correlation, plot_history, plot_net, plot_residual
-from jeuler.plotting.report import FitReport, Net, Parameter
+from jeuler.plotting.report import FitReport, Net, Parameter, Shown
 from jeuler.plotting.residuals import autocorrelation
 
 TIMES = np.linspace(0.0, 5.0, 60)
@@ -20,10 +20,7 @@ DATA = np.stack([np.sin(3 * TIMES), np.where(TIMES < 1, np.nan, np.cos(3 * TIMES
 PARTS = {
     "title": "a <b> & c",
     "verdict": "Converged.",
-    "times": TIMES,
-    "observed": DATA,
-    "predicted": DATA + 1e-3 * np.sin(40 * TIMES)[:, None],
-    "names": ["x $1$", "y", "never seen"],
+    "shown": [Shown(TIMES, DATA, DATA + 1e-3 * np.sin(40 * TIMES)[:, None], ["x $1$", "y", "never seen"])],
     "parameters": [
         Parameter("ks", 20.0, 0.5, "N/m"),
         Parameter("mass", 1.0, np.inf, "kg"),
@@ -82,6 +79,18 @@ def test_the_page_holds_all_and_fetches_nothing():
         assert words in page
 
 
+def test_unlike_sensors_have_figures_of_their_own():
+    kinds = ("position", "m", "recording 1"), ("reading of position", "", "recordings 2, 3")
+    shown = [Shown(TIMES, DATA, 1.01 * DATA, ["a", "b", "c"], unit, what, whose) for what, unit, whose in kinds]
+    page = FitReport(**(PARTS | {"shown": shown})).html()
+    headings = re.findall("<h2>(.*?)</h2>", page)[1:]
+    assert headings == [
+        f"{part}: {what}, {whose}" for what, _, whose in kinds for part in ("Data and fit", "What the fit leaves")
+    ]
+    assert len(set(Links(page).ids)) == len(Links(page).ids)
+    assert "[]" not in page
+
+
 def test_what_is_not_there_has_no_heading():
     page = FitReport(**PARTS).html()
     for heading in ("Summary", "The springs", "Correlation", "The search", "What to do next"):
@@ -92,8 +101,8 @@ def test_what_is_not_there_has_no_heading():
 def test_a_page_that_fails_leaves_what_stood_there(tmp_path):
     path = tmp_path / "fit.html"
     path.write_text("before")
-    with pytest.raises(ValueError, match="time, column"):
-        FitReport(**(PARTS | {"observed": DATA[:, 0], "predicted": DATA[:, 0]})).write(path)
+    with pytest.raises(ValueError, match="correlation must be"):
+        FitReport(**PARTS, correlation=(["ks", "kd"], np.eye(3))).write(path)
     assert path.read_text() == "before"
     assert os.listdir(tmp_path) == ["fit.html"]
     FitReport(**PARTS).write(path)
@@ -175,6 +184,7 @@ def test_nets_of_every_dimension(dim):
     ("call", "words"),
     [
         (lambda: plot_residual(TIMES, TIMES), "residual must be"),
+        (lambda: Shown(TIMES, DATA[:, 0], DATA[:, 0], ["x"]), r"must be \(time, column\) = \(60, 1\)"),
         (lambda: plot_correlation(["ks"], np.eye(2)), "correlation must be"),
         (lambda: plot_net(np.zeros((2, 2)), [[0, 1]], [1.0, 2.0]), "edges must be"),
     ],

@@ -15,23 +15,18 @@ if TYPE_CHECKING:
 
 def page(measured: Measurement, found: Estimate, result: dict[str, Any]) -> FitReport:
     """What is printed, with figures: data and fit, the residual, and the correlation of the errors."""
-    from jeuler.plotting.report import FitReport, Parameter
+    from jeuler.plotting.report import FitReport, Parameter, Shown
 
-    count = len(measured.times)
+    observed, predicted = (x.reshape(len(measured.times), -1) for x in (measured.positions, found.predicted))
     spread = " and ".join(f"{name} = {value:.5g} {unit}" for name, value, _, unit in fitted_numbers(result)[:2])
     return FitReport(
         title=f"Fit of {heading(result)}",
         verdict=f"{spread}. The fit {result['message']} in {result['iterations']} iterations.",
-        times=measured.times,
-        observed=measured.positions.reshape(count, -1),
-        predicted=found.predicted.reshape(count, -1),
-        names=measured.names,
+        shown=[Shown(measured.times, observed, predicted, measured.names, measured.unit, measured.quantity)],
         parameters=[
             Parameter(name, value, _error(value, error), unit, "" if value else "at its bound 0")
             for name, value, error, unit in fitted_numbers(result)
         ],
-        unit=measured.unit,
-        quantity=measured.quantity,
         facts=[*used(result), *derived(result), *compared(result)],
         warnings=result["warnings"],
         next_steps=list(_next_steps(result)),

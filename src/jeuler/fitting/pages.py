@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +24,7 @@ RECORDING = "recording"  # under this name what was fitted is kept beside a `Spr
 
 def page_of(found: SpringFit) -> FitReport:
     """The page of a fit, with the recording that it was made from."""
-    from jeuler.plotting.report import FitReport
+    from jeuler.plotting.report import FitReport, Shown
 
     task: Recorded | Several | None = attached(found, RECORDING)
     if task is None or task.traced:
@@ -32,20 +32,21 @@ def page_of(found: SpringFit) -> FitReport:
             "a report needs the fit as `fit_springs` gave it, with its data: "
             "a copy, and what comes out of jit or vmap, has none; fit again"
         )
-    shown, rows = task.series(found.predicted), list(_rows(found))
-    several = len(shown.steps)
+    kinds, rows = task.series(found.predicted), list(_rows(found))
+    several = sum(len(kind.steps) for kind in kinds)
+    times = sum(len(kind.times) - len(kind.steps) + 1 for kind in kinds)
     return FitReport(
-        title=f"Fit of {len(rows)} parameter{'s' * (len(rows) > 1)} to {len(shown.times) - several + 1} times"
+        title=f"Fit of {len(rows)} parameter{'s' * (len(rows) > 1)} to {times} times"
         + f" of {several} recordings" * (several > 1),
         verdict=found.message[:1].upper() + found.message[1:] + ".",
-        times=shown.times,
-        observed=shown.observed,
-        predicted=shown.predicted,
-        names=shown.names,
-        unit=shown.unit,
-        quantity=shown.quantity,
+        shown=[
+            Shown(
+                kind.times, kind.observed, kind.predicted, kind.names, kind.unit, kind.quantity, _whose(kind, several)
+            )
+            for kind in kinds
+        ],
         parameters=rows,
-        facts=list(_facts(found, shown, task.dt)),
+        facts=list(_facts(found, kinds, task.dt)),
         next_steps=list(next_steps(found)),
         correlation=None if found.covariance is None else ([row.name for row in rows], found.correlation),
         history=found.history,
@@ -71,17 +72,28 @@ def _rows(found: SpringFit) -> Iterator[Parameter]:
         yield Parameter(name, value, error, unit_of(name.split("[")[0], found.scene), "; ".join(notes))
 
 
-def _facts(found: SpringFit, shown: Series, dt: float) -> Iterator[tuple[str, str]]:
+def _whose(kind: Series, several: int) -> str:
+    """Which recordings are shown, counted from 1; "" where there is only one."""
+    if several == 1:
+        return ""
+    numbers = [str(k + 1) for k in kind.recordings]
+    return f"recording{'s' * (len(numbers) > 1)} {', '.join(numbers[:8])}{' ...' * (len(numbers) > 8)}"
+
+
+def _facts(found: SpringFit, kinds: Sequence[Series], dt: float) -> Iterator[tuple[str, str]]:
     """The summary."""
-    residual = shown.observed - shown.predicted
-    kind = "coordinates" if shown.quantity == "position" else "values"
-    span = f"{shown.times[0]:.5g} to {shown.times[-1]:.5g} s" + ", one after another" * (len(shown.steps) > 1)
-    yield "observed", f"{int(np.isfinite(residual).sum())} {kind} from {span}"
-    yield "simulation", f"{', '.join(map(str, shown.steps[:8]))}{' ...' * (len(shown.steps) > 8)} steps of {dt:.4g} s"
-    yield "residual, RMS", f"{np.sqrt(np.nanmean(residual**2)):.4g} {shown.unit}".rstrip()
+    for kind in kinds:
+        what = f", {kind.quantity}" * (len(kinds) > 1)
+        numbers = "coordinates" if kind.quantity == "position" else "values"
+        span = f"{kind.times[0]:.5g} to {kind.times[-1]:.5g} s" + ", one after another" * (len(kind.steps) > 1)
+        yield f"observed{what}", f"{kind.count} {numbers} from {span}"
+        yield f"residual, RMS{what}", f"{kind.rms:.4g} {kind.unit}".rstrip()
+    steps = [step for kind in kinds for step in kind.steps]
+    yield "simulation", f"{', '.join(map(str, steps[:8]))}{' ...' * (len(steps) > 8)} steps of {dt:.4g} s"
     if found.held_out_rms is not None:
-        yield "residual, RMS, of what was fitted", f"{found.training_rms:.4g} {shown.unit}".rstrip()
-        yield "residual, RMS, of what was held out", f"{found.held_out_rms:.4g} {shown.unit}".rstrip()
+        unit = kinds[0].unit if len(kinds) == 1 else "in the units of the readings"
+        yield "residual, RMS, of what was fitted", f"{found.training_rms:.4g} {unit}".rstrip()
+        yield "residual, RMS, of what was held out", f"{found.held_out_rms:.4g} {unit}".rstrip()
     if found.explained is not None:
         yield "variance explained", f"{100 * found.explained:.5g} %"
     if found.noise_ratio is not None:

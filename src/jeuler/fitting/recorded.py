@@ -246,10 +246,10 @@ class Recorded:
         observed, shown = (np.asarray(y, float).reshape(len(self.times), -1) for y in (self.targets, predicted))
         return [(self.times, observed, shown)]
 
-    def series(self, predicted: Any) -> Series:
-        """What was measured beside what was predicted."""
+    def series(self, predicted: Any) -> list[Series]:
+        """What was measured beside what was predicted: one kind of readings."""
         names = column_names("position", np.shape(self.targets)[1:], None)
-        return Series(*self.series_of_each(predicted)[0], names, "position", "m", [self.prediction.num_steps])
+        return [Series(*self.series_of_each(predicted)[0], names, "position", "m", [self.prediction.num_steps])]
 
     def completed(self, outcome: Outcome, step_bias: bool) -> tuple[dict[str, Any], Any, Scene, ParticleState, Array]:
         """What a `SpringFit` has beside the `Fit`: the bias of the step, scene, state and prediction."""

@@ -17,6 +17,7 @@ class Series:
 
     Attributes:
       times: (time,), s; of several recordings one after another, with a row of NaN between them.
+      recordings: which of the fit's recordings these are, from 0.
       observed, predicted: (time, column); NaN = not observed.
       names: of the columns.  quantity, unit: of what they show.
       steps: of the simulation, for each recording.
@@ -29,6 +30,17 @@ class Series:
     quantity: str
     unit: str
     steps: list[int]
+    recordings: tuple[int, ...] = (0,)
+
+    @property
+    def count(self) -> int:
+        """How many numbers were measured."""
+        return int(np.isfinite(self.observed - self.predicted).sum())
+
+    @property
+    def rms(self) -> float:
+        """Of the residual."""
+        return float(np.sqrt(np.nanmean((self.observed - self.predicted) ** 2)))
 
 
 def one_after_another(

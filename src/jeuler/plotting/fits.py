@@ -69,16 +69,21 @@ def plot_fit(
     below.axhline(0, color="0.3", linewidth=0.8)
     below.axhspan(-rms, rms, color="0.85", zorder=0)
     below.annotate(
-        f"RMS {rms:.3g} {unit}", (0.995, 0.04), xycoords="axes fraction", ha="right", va="bottom", fontsize=9
+        f"RMS {rms:.3g} {unit}".rstrip(), (0.995, 0.04), xycoords="axes fraction", ha="right", va="bottom", fontsize=9
     )
-    above.set_ylabel(f"position [{unit}]")
-    below.set_ylabel(f"data − fit [{unit}]")
+    above.set_ylabel(in_unit("position", unit))
+    below.set_ylabel(in_unit("data − fit", unit))
     below.set_xlabel("time [s]")
     above.legend(loc="upper right", fontsize=8, ncols=2, framealpha=0.9)
     above.set_title(title, fontsize=10)
     for axis in (above, below):
         axis.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def in_unit(words: str, unit: str) -> str:
+    """The label of an axis; a reading without a unit has none."""
+    return f"{words} [{unit}]" if unit else words
 
 
 def plain_text(text: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jeuler._core.files import write_text
-from jeuler.plotting.fits import plain_text, plot_fit
+from jeuler.plotting.fits import in_unit, plain_text, plot_fit
 from jeuler.plotting.residuals import plot_correlation, plot_history, plot_net, plot_residual
 
 MOST_POINTS = 1500  # of a column in a figure: what is denser is thinned
@@ -69,34 +69,22 @@ class Net:
 
 
 @dataclasses.dataclass(frozen=True)
-class FitReport:
-    """What a report of a fit shows.
+class Shown:
+    """Readings of one kind over time, which share an axis.
 
     Attributes:
-      title, verdict: what was fitted, and how it went, in a sentence.
       times: (time,), s.  observed, predicted: (time, column); NaN = not observed.
       names, unit: of the columns.  quantity: what they are, such as "position".
-      parameters: the rows of the table.  warnings: sentences.  next_steps: what to do now.
-      facts: (what, value) of the summary.
-      correlation: names of the parameters and the matrix, or None.  history: of the loss, or None.
-      net: the springs, or None.
+      whose: which recordings they are from; "" where there is one.
     """
 
-    title: str
-    verdict: str
     times: Any
     observed: Any
     predicted: Any
     names: Sequence[str]
-    parameters: Sequence[Parameter]
     unit: str = "m"
     quantity: str = "position"
-    facts: Sequence[tuple[str, str]] = ()
-    warnings: Sequence[str] = ()
-    next_steps: Sequence[str] = ()
-    correlation: tuple[Sequence[str], Any] | None = None
-    history: Any = None
-    net: Net | None = None
+    whose: str = ""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.observed)
@@ -105,6 +93,52 @@ class FitReport:
                 f"observed and predicted must be (time, column) = ({len(self.times)}, {len(self.names)}), "
                 f"got {shape} and {np.shape(self.predicted)}"
             )
+
+    def page(self) -> Iterator[str]:
+        """Data over prediction and the residual, of the columns with the largest residuals."""
+        observed, predicted = np.asarray(self.observed, float), np.asarray(self.predicted, float)
+        residual = observed - predicted
+        seen = np.flatnonzero(np.isfinite(residual).any(axis=0))
+        size = np.nansum(residual[:, seen] ** 2, axis=0)
+        shown = np.sort(seen[np.argsort(-size, kind="stable")[:MOST_COLUMNS]])
+        thin = slice(None, None, max(1, -(-len(residual) // MOST_POINTS)))
+        names = tuple(plain_text(self.names[k]) for k in shown)
+        times = np.asarray(self.times, float)
+        curves = plot_fit(times[thin], observed[thin][:, shown], predicted[thin][:, shown], names=names, unit=self.unit)
+        curves.axes[0].set_ylabel(in_unit(self.quantity, self.unit))
+        of = f": {self.quantity}, {self.whose}" * bool(self.whose)
+        yield f"<h2>{html.escape(f'Data and fit{of}')}</h2>"
+        if len(shown) < len(seen):
+            yield f'<p class="note">The {len(shown)} columns of {len(seen)} with the largest residuals.</p>'
+        yield _figure(curves, f"data and fit over time, and the residual{of}")
+        yield f"<h2>{html.escape(f'What the fit leaves{of}')}</h2>"
+        details = plot_residual(times, residual[:, shown], names=names, unit=self.unit)
+        yield _figure(details, f"residual in detail{of}")
+
+
+@dataclasses.dataclass(frozen=True)
+class FitReport:
+    """What a report of a fit shows.
+
+    Attributes:
+      title, verdict: what was fitted, and how it went, in a sentence.
+      shown: the readings, one for each kind of sensor.
+      parameters: the rows of the table.  warnings: sentences.  next_steps: what to do now.
+      facts: (what, value) of the summary.
+      correlation: names of the parameters and the matrix, or None.  history: of the loss, or None.
+      net: the springs, or None.
+    """
+
+    title: str
+    verdict: str
+    shown: Sequence[Shown]
+    parameters: Sequence[Parameter]
+    facts: Sequence[tuple[str, str]] = ()
+    warnings: Sequence[str] = ()
+    next_steps: Sequence[str] = ()
+    correlation: tuple[Sequence[str], Any] | None = None
+    history: Any = None
+    net: Net | None = None
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """The page, written whole or not at all."""
@@ -131,7 +165,8 @@ class FitReport:
         if self.next_steps:
             items = "".join(f"<li>{html.escape(step)}</li>" for step in self.next_steps)
             yield f"<h2>What to do next</h2><ul>{items}</ul>"
-        yield from self._series()
+        for shown in self.shown:
+            yield from shown.page()
         yield from self._net_and_search()
         if len(self.parameters) > SHORT_TABLE:
             yield from self._table()
@@ -164,26 +199,6 @@ class FitReport:
         yield "</table></div>"
         if len(self.parameters) > MOST_ROWS:
             yield f'<p class="note">and {len(self.parameters) - MOST_ROWS} more</p>'
-
-    def _series(self) -> Iterator[str]:
-        """Data over prediction and the residual, of the columns with the largest residuals."""
-        observed, predicted = np.asarray(self.observed, float), np.asarray(self.predicted, float)
-        residual = observed - predicted
-        seen = np.flatnonzero(np.isfinite(residual).any(axis=0))
-        size = np.nansum(residual[:, seen] ** 2, axis=0)
-        shown = np.sort(seen[np.argsort(-size, kind="stable")[:MOST_COLUMNS]])
-        note = [f'<p class="note">The {len(shown)} columns of {len(seen)} with the largest residuals.</p>']
-        note = note if len(shown) < len(seen) else []
-        thin = slice(None, None, max(1, -(-len(residual) // MOST_POINTS)))
-        names = tuple(plain_text(self.names[k]) for k in shown)
-        times = np.asarray(self.times, float)
-        curves = plot_fit(times[thin], observed[thin][:, shown], predicted[thin][:, shown], names=names, unit=self.unit)
-        curves.axes[0].set_ylabel(f"{self.quantity} [{self.unit}]")
-        yield "<h2>Data and fit</h2>"
-        yield from note
-        yield _figure(curves, "data and fit over time, and the residual")
-        yield "<h2>What the fit leaves</h2>"
-        yield _figure(plot_residual(times, residual[:, shown], names=names, unit=self.unit), "residual in detail")
 
 
 def _right(number: bool) -> str:

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from jeuler.plotting.fits import COLORS
+from jeuler.plotting.fits import COLORS, in_unit
 
 MOST_NAMES = 40  # parameters whose names are written beside a correlation matrix
 MOST_NUMBERS = 10  # parameters whose correlations are written as numbers
@@ -60,9 +60,9 @@ def plot_residual(times: Any, residual: Any, *, names: tuple[str, ...] | None = 
         band = max(band, 1.96 / np.sqrt(seen.sum()))
     panels["lags"].axhspan(-band, band, color="0.87", zorder=0)
     panels["over"].axhline(0, color="0.3", linewidth=0.8)
-    panels["over"].set(xlabel="time [s]", ylabel=f"data − fit [{unit}]")
+    panels["over"].set(xlabel="time [s]", ylabel=in_unit("data − fit", unit))
     panels["lags"].set(xlabel="lag [s]", ylabel="autocorrelation", title="grey: white noise (95 %)")
-    panels["lines"].set(xlabel="frequency [Hz]", ylabel=f"amplitude [{unit}]", title="spectrum")
+    panels["lines"].set(xlabel="frequency [Hz]", ylabel=in_unit("amplitude", unit), title="spectrum")
     if residual.shape[1] <= len(COLORS) and panels["over"].lines[:-1]:
         panels["over"].legend(fontsize=8, ncols=3, loc="upper right", framealpha=0.9)
     for axis in panels.values():

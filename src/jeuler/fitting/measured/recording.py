@@ -13,6 +13,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler._core.component import replace, result
 from jeuler.fitting.observations import checked_observations, place_in_steps
+from jeuler.fitting.series import column_names
 from jeuler.observing import Sensor
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
@@ -140,6 +141,15 @@ class Checked:
         """What was observed and is fitted, (time, number)."""
         xp: Any = jnp if checks.is_traced(self.targets) else np
         return xp.isfinite(self.flat) & ~self.left_out[:, None]
+
+    def shown_as(self, gain: bool) -> tuple[str, str, tuple[str, ...]]:
+        """Quantity, unit and names of the numbers; of a sensor with a gain, given or fitted, in a unit of its own."""
+        observed = self.sensor.observation
+        particles = getattr(observed, "particles", None)
+        names = column_names(observed.quantity, self.targets.shape[1:], None if particles is None else particles[:])
+        if gain or np.any(np.asarray(self.sensor.gain) != 1):
+            return f"reading of {observed.quantity}", "", tuple(names)
+        return observed.quantity, observed.unit, tuple(names)
 
     def data(self, dt: float, num_steps: int, count: int) -> dict[str, Any]:
         """What the compiled programs take, filled up to a number of times."""

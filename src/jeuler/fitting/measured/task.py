@@ -33,7 +33,7 @@ from jeuler.fitting.parameters import Places
 from jeuler.fitting.priors import Alike
 from jeuler.fitting.problem import Problem
 from jeuler.fitting.result import Fit
-from jeuler.fitting.series import Columns, Series, column_names, one_after_another
+from jeuler.fitting.series import Columns, Series, one_after_another
 from jeuler.fitting.smoothness import alike_neighbours
 from jeuler.fitting.step_bias import RANDOM, UNKNOWN, shifted
 from jeuler.fitting.two_starts import from_both
@@ -273,21 +273,23 @@ class Several:
             parts.append((r.times, observed, shown))
         return parts
 
-    def series(self, predicted: Any) -> Series:
-        """What was measured beside what was predicted, one recording after another."""
-        longest = max(self.records, key=lambda r: r.size)
-        observation = longest.sensor.observation
-        kinds = {(observed.quantity, observed.unit) for observed in (r.sensor.observation for r in self.records)}
-        quantity, unit = kinds.pop() if len(kinds) == 1 else ("reading", "")
-        particles = getattr(observation, "particles", None)
-        names = column_names(quantity, longest.targets.shape[1:], None if particles is None else particles[:])
-        return Series(
-            *one_after_another(self.series_of_each(predicted)),
-            names,
-            quantity,
-            unit,
-            [r.num_steps for r in self.records],
-        )
+    def series(self, predicted: Any) -> list[Series]:
+        """What was measured beside what was predicted, one for each kind of sensor: its recordings in line."""
+        kinds: dict[tuple[str, str, tuple[str, ...]], list[int]] = {}
+        for k, record in enumerate(self.records):
+            kinds.setdefault(record.shown_as("gain" in self.residual.of_sensor), []).append(k)
+        parts = self.series_of_each(predicted)
+        return [
+            Series(
+                *one_after_another([parts[k] for k in members]),
+                list(names),
+                quantity,
+                unit,
+                [self.records[k].num_steps for k in members],
+                tuple(members),
+            )
+            for (quantity, unit, names), members in kinds.items()
+        ]
 
     def completed(self, outcome: Outcome, step_bias: bool) -> tuple[dict[str, Any], Any, Scene, Any, Any]:
         """What a `SpringFit` has beside the `Fit`: the bias of the step, scene, states and predictions."""
