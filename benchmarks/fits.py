@@ -6,18 +6,25 @@
     python benchmarks/fits.py coverage             how often nominal 95 % intervals hold the truth, 500 records each
     python benchmarks/fits.py starts [cases]       one oscillator, starts wrong by up to 100, and aliased tenfold
     python benchmarks/fits.py net_starts [cases] [first]   a net of 5 by 5, the same, from case ``first`` on
+    python benchmarks/fits.py kills [kills]        fits killed at random moments, taken up again: the same bits or not
+    python benchmarks/fits.py profiles [side]      profile intervals of single springs of a cloth
 
 Data are made by diffrax's Tsit5 at 1e-9, or exactly; the fit runs RK4. mujoco.sysid is left out where it is not there.
 """
 
 import collections
+import hashlib
+import os
+import subprocess
 import sys
+import tempfile
 import time
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from scipy.signal import lfilter
 from scipy.spatial import Delaunay
 
@@ -66,7 +73,7 @@ def cloth(side=70, seed=0):
     edges = edges[(edges >= side).any(axis=1)]  # between two that are pinned nothing can be seen
     x = np.stack([index.ravel() % side, index.ravel() // side, 0 * index.ravel()], axis=1) * 0.6
     x = x + 0.05 * random.normal(size=x.shape)  # in a plane, what pulls across it would be blind
-    recovered(x, edges, np.where(np.arange(side * side) < side, np.inf, 1.0), random)
+    return recovered(x, edges, np.where(np.arange(side * side) < side, np.inf, 1.0), random)
 
 
 def recovered(x, edges, mass, random):
@@ -88,6 +95,7 @@ def recovered(x, edges, mass, random):
         if found.stderr is not None:
             off = np.abs(np.asarray(found.params[name]) - truth) / np.asarray(found.stderr[name])
             print(f"    95 % intervals hold {np.mean(off < 1.96):.1%}", flush=True)
+    return found
 
 
 def chain(count, seed=0):
@@ -192,7 +200,8 @@ def net_starts(cases=100, first=0):
         try:
             found = jeuler.fit_springs(scene, state, t, y, dt=dt, start=start, max_iterations=60, progress=False)
         except ValueError as error:
-            counted[f"{start}, {'aliased, ' if aliased else ''}said ({str(error)[:40]})"] += 1
+            counted[f"{start}, {'aliased, ' if aliased else ''}refused"] += 1
+            print(case, start, f"{factor:.3g}", aliased, "refused", str(error)[:200], flush=True)
             continue
         off, error = np.abs(np.asarray(found.ks) - ks), np.asarray(found.stderr["ks"])
         right = np.mean((off < 0.02 * ks) | (off < 4 * error)) > 0.97
@@ -202,12 +211,87 @@ def net_starts(cases=100, first=0):
     print(dict(counted))
 
 
+SLOW = 0.03  # s that an evaluation of the residual takes, so that there are moments between them
+
+
+def slow_fit(kind, path):
+    """One of the fits that are killed; what it found as a digest of all its numbers."""
+    t = np.linspace(0, 3, 60)
+    y = 2 * np.exp(-0.5 * t) * np.cos(6 * t) + 0.1 * np.random.default_rng(0).normal(size=60)
+
+    def residual(p, data):
+        jax.debug.callback(lambda: time.sleep(SLOW))
+        t, y = data[:, 0], data[:, 1]
+        return p["a"] * jnp.exp(-p["k"] * t) * jnp.cos(p["w"] * t) + jnp.sum(p.get("more", jnp.zeros(1))) - y
+
+    start, adam = {"a": 1.0, "k": 0.1, "w": 4.6}, {"optimizer": optax.adam(0.02), "max_iterations": 120}
+    options = {
+        "search": {"tolerance": 1e-13, "stages": [np.where(t < end, 1.0, 0.0) for end in (0.3, 0.6, 1.2, 2.0)]},
+        "starts": {"starts": 24, "positive": True},
+        "descent": adam,
+        "minibatches": adam | {"minibatch": 16},
+        "without a Jacobian": {"loss": "huber", "loss_scale": 0.05},
+    }[kind]
+    if kind == "without a Jacobian":
+        start = start | {"more": jnp.zeros(600)}
+    print("begun", flush=True)
+    found = jeuler.fit(residual, start, data=np.stack([t, y], 1), resume=path, progress=False, **options)
+    digest = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(found)))
+    print(digest.hexdigest(), found.message[:60], flush=True)
+
+
+def kills(count=20):
+    """Each kind of fit killed at random moments, one after the other, and then left to end."""
+    random, kinds = np.random.default_rng(0), ["search", "starts", "descent", "minibatches", "without a Jacobian"]
+    for kind in kinds:
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, __file__, "slow_fit", kind]
+            path, killed, taken_up = os.path.join(folder, "state"), 0, 0
+            whole = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[1]
+            for _ in range(count // len(kinds)):
+                taken_up += os.path.exists(path)
+                with subprocess.Popen([*command, path], stdout=subprocess.PIPE, text=True) as running:
+                    running.stdout.readline()  # it has begun
+                    time.sleep(random.uniform(0.2, 4.0))
+                    killed += running.poll() is None
+                    running.kill()
+            last = subprocess.run([*command, path], capture_output=True, text=True, check=True).stdout.splitlines()[1]
+            left = sorted(os.listdir(folder))
+        same = "the same bits" if last == whole else "OTHER"
+        print(
+            f"{kind}: killed {killed} times, taken up {taken_up} times: {same}; left {left}; {whole[65:]}", flush=True
+        )
+
+
+def profiles(side=20):
+    """Profile intervals of single springs of a cloth, in seconds and standard errors."""
+    found = cloth(side)
+    for name in ("ks[17]", "kd[17]", "ks[100]"):
+        begun, busy = time.perf_counter(), time.process_time()
+        error, interval = found.standard_error(name), found.profile(name)
+        seconds, busy = time.perf_counter() - begun, time.process_time() - busy
+        ends = [(end - interval.value) / error for end in (interval.lower, interval.upper)]
+        print(f"{name}: {ends[0]:.3f} to {ends[1]:+.3f} standard errors, ends found: {interval.converged}", end="; ")
+        print(f"{seconds:.1f} s ({busy:.1f} s of CPU)", flush=True)
+
+
 if __name__ == "__main__":
     what, *words = sys.argv[1:] or ["net"]
+    if what == "slow_fit":
+        slow_fit(words[0], words[1] if words[1:] else None)
+        sys.exit()
     numbers = [int(word) for word in words]
     if what == "net_starts":
         net_starts(*numbers)
     else:
-        run = {"net": net, "cloth": cloth, "chain": chain, "coverage": coverage, "starts": starts}[what]
+        run = {
+            "net": net,
+            "cloth": cloth,
+            "chain": chain,
+            "coverage": coverage,
+            "starts": starts,
+            "kills": kills,
+            "profiles": profiles,
+        }[what]
         for number in numbers or [None]:
             run(*([number] if number else []))

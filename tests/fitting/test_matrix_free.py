@@ -156,6 +156,28 @@ def test_errors_of_many_unknowns_are_those_of_few(rho, sigma, without_a_jacobian
     np.testing.assert_allclose(many.autocorrelation, few.autocorrelation, atol=0.1)
 
 
+@pytest.mark.parametrize("loss", ["linear", "soft_l1"])
+def test_profiles_of_many_unknowns_are_those_of_few(loss, without_a_jacobian):
+    """Between bounds, with the errors of all unknowns and with those that are asked for; noise that makes it bend."""
+    noise = 0.1 * np.random.default_rng(5).normal(size=(60, 6))
+    x = {"a": np.full(6, 1.5), "k": np.ones(6)}
+    options = {"data": np.asarray(residual(TRUTH, 0.0)) + noise, "bounds": {"a": (0.0, 3.0)}, "loss": loss}
+    options |= {"loss_scale": 0.2} if loss != "linear" else {}
+    names, ends = ("a[0]", "a[5]", "k[1]"), {}
+    for most_errors in (None, 12, 0):
+        if most_errors is not None:
+            without_a_jacobian(most_errors)
+        found = jeuler.fit(residual, x, **options)
+        ends[most_errors] = [found.profile(name) for name in names]
+        assert all(interval.converged for interval in ends[most_errors])
+    for few, many, asked in zip(*ends.values(), strict=True):
+        for other in (many, asked):
+            np.testing.assert_allclose(
+                [other.lower, other.upper], [few.lower, few.upper], atol=0.02 * (few.upper - few.lower)
+            )
+    assert ends[0][1].upper == 3.0
+
+
 def test_what_many_data_do_not_determine_is_named(without_a_jacobian):
     without_a_jacobian(most_errors=3)
     x = np.linspace(0.0, 1.0, 30)
@@ -192,7 +214,7 @@ def test_the_best_of_several_starts_is_kept(without_a_jacobian):
 
 def test_what_is_asked_for_in_vain_is_said(without_a_jacobian):
     found = jeuler.fit(residual, {"a": np.ones(6), "k": np.ones(6)}, data=data())
-    for of, words in (("b", "of must name"), (lambda p: p["a"], "one number"), (3, "of must be")):
+    for of, words in (("b", "of must be one of"), (lambda p: p["a"], "one number"), (3, "of must be")):
         with pytest.raises(ValueError, match=words):
             found.standard_error(of)
     with pytest.raises(ValueError, match="of must have a finite derivative"):

@@ -1,5 +1,7 @@
 """What a fit may vary, by name; the bias of the step; bad input: one clear message each, with the remedy."""
 
+import re
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,8 +25,8 @@ STATE = jeuler.ParticleState([[0.0], [1.3]], jnp.zeros((2, 1)), mass=[jnp.inf, 1
 FLOOR = jeuler.PenaltyContact(jeuler.Plane([-9.0], [1.0]), ks=50.0, kd=1.0, radius=0.1)
 
 
-def scene(*others, ks=80.0, kd=0.2):
-    return jeuler.Scene((*others, jeuler.Springs([[0, 1]], ks=ks, kd=kd, rest_length=1.0)))
+def scene(*others, ks=80.0, kd=0.2, edges=((0, 1),)):
+    return jeuler.Scene((*others, jeuler.Springs(edges, ks=ks, kd=kd, rest_length=1.0)))
 
 
 def test_names_speak_of_springs_first():
@@ -110,25 +112,6 @@ def test_two_gliders_reach_the_minimum_with_damping_at_zero():
     np.testing.assert_allclose(found.ks, [3, 30, 3], rtol=0.01)
 
 
-def test_the_scene_is_fitted_under_vmap_and_its_gradient_is_that_of_the_optimum():
-    many = jnp.asarray(np.stack([seen(SWING[:41] + 1e-3 * np.sin(k * T[:41])) for k in range(3)]))
-    many = jnp.nan_to_num(many)
-
-    def stiffness(y):
-        sigma = jnp.asarray([[jnp.inf], [1e-3]])
-        return jeuler.fit_springs(scene(ks=95.0), STATE, T[:41], y, dt=0.025, sigma=sigma, tolerance=1e-9).ks
-
-    together = jax.jit(jax.vmap(stiffness))(many)
-    alone = [stiffness(y) for y in many]
-    np.testing.assert_allclose(together, alone, rtol=1e-4)
-    slope = jax.jit(jax.grad(stiffness))(many[0])
-    step = np.zeros(many[0].shape)
-    step[20, 1, 0] = 1e-5
-    np.testing.assert_allclose(
-        slope[20, 1, 0], (stiffness(many[0] + step) - stiffness(many[0] - step)) / 2e-5, rtol=1e-3
-    )
-
-
 BAD_SPRINGS = {
     "springs": ({"scene": 3.0}, "scene must be a Scene"),
     "state": ({"state": 3.0}, "state must be a ParticleState"),
@@ -171,6 +154,13 @@ BAD_SPRINGS = {
     "times repeat": ({"times": np.zeros(101)}, "times must .* two different times"),
     "too few": ({"times": T[:1], "positions": seen()[:1]}, "times must .* two different times"),
     "constant": ({"positions": np.ones((101, 2, 1))}, "positions must move"),
+    "zeros": ({"positions": np.zeros((101, 2, 1))}, "positions must move"),
+    "seen once": ({"positions": np.where(np.arange(101)[:, None, None] == 7, seen(), np.nan)}, "positions must move"),
+    "never seen": ({"positions": np.full((101, 2, 1), np.nan)}, "at least one finite value"),
+    "infinite": ({"positions": seen(np.where(T == 1.0, np.inf, SWING))}, "positions must be finite, or NaN"),
+    "one sigma zero": ({"sigma": np.where(np.arange(101)[:, None, None] == 7, 0.0, 1e-3)}, "sigma must be greater"),
+    "sigma leaves none": ({"sigma": np.inf}, "at least one residual"),
+    "all held": ({"bounds": {"ks": (80.0, 80.0), "kd": (0.2, 0.2)}}, "bounds must leave something to fit"),
     "blows up": (
         {"scene": scene(ks=1e12), "start": "given", "dt": 0.05},
         "not finite at the start.*smaller dt or a stabler step",
@@ -206,12 +196,47 @@ def test_bad_input_of_fit_springs(name):
         ({"scene": jeuler.Scene((jeuler.Springs([[0, 1]], 80.0, 0.2, 1000.0),))}, "rest_length is 1e\\+03 m where the"),
         ({"bounds": {"ks": (0.0, 90.0)}}, "ks ended on a bound"),
         ({"times": T[:3], "positions": seen()[:3]}, "do not determine|not told apart|there are only"),
+        ({"times": T[[7, 20]], "positions": seen()[[7, 20]]}, "only 2 data for 2 parameters: no errors without sigma"),
+        ({"scene": scene(edges=[[0, 1], [1, 0]], ks=[40.0, 40.0])}, r"ks\[0\] and ks\[1\] only as their sum"),
     ],
 )
 def test_doubtful_input_gets_its_word(change, words):
-    import re
-
     arguments = {"times": T, "positions": seen(), "dt": 0.02, **change}
     given, times = arguments.pop("scene", scene()), arguments.pop("times")
     found = jeuler.fit_springs(given, STATE, times, arguments.pop("positions"), **arguments)
     assert re.search(words, found.message), found.message
+
+
+@pytest.mark.parametrize(
+    ("params", "names"),
+    [
+        ({"ks": np.ones(2), "forces[1].ks": 1.0}, ("forces[1].ks", "ks[0]", "ks[1]")),
+        (
+            {"ks": (1.0, np.ones(1)), "velocity": np.ones((1, 2))},
+            ("ks[0]", "ks[1][0]", "velocity[0, 0]", "velocity[0, 1]"),
+        ),
+        ({"net": {"weight": np.ones(1), "two words": 0.5}}, ("net['two words']", "net.weight[0]")),
+        (
+            {"net": jax.tree.map(jnp.abs, eqx.nn.Linear(1, 1, key=jax.random.key(0)))},
+            ("net.weight[0, 0]", "net.bias[0]"),
+        ),
+        ([1.0, np.ones(1)], ("params[0]", "params[1][0]")),
+        (1.0, ("params",)),
+    ],
+)
+def test_numbers_are_named_as_they_are_written_wherever_they_show(params, names):
+    """One number is on its bound, the rest is not seen: names in attributes, message and table, and asked for."""
+    from jax.flatten_util import ravel_pytree
+
+    found = jeuler.fit(lambda p: ravel_pytree(p)[0][:1] - np.array([3.0, 3.0]), params, bounds=(0.0, 2.0))
+    assert found.at_bound == names[:1]
+    assert found.undetermined == found.blind == names[1:]
+    assert f"{names[0]} ended on a bound" in found.message
+    assert all(name in found.message for name in names)
+    for text in (found.message, repr(found), found._repr_html_()):
+        assert "['" not in text.replace("['two words']", "")
+        assert '["' not in text
+    assert np.isinf(found.standard_error(names[-1])) == (len(names) > 1)
+    assert found.profile(names[0]).upper == 2.0
+    with pytest.raises(ValueError, match=f"of must be one of {re.escape(names[0])}"):
+        found.standard_error("['ks'][0]")

@@ -70,7 +70,7 @@ def test_spring_between_pinned_particles_stays_and_is_named():
     state = jeuler.ParticleState(position, velocity, mass)
     found = jeuler.fit_springs(scene([7.0, 25.0, 25.0]), state, times, targets, dt=0.02, parameters=("ks",))
     np.testing.assert_allclose(found.ks, [7.0, 20.0, 30.0], rtol=1e-4)
-    assert found.undetermined == ("['ks'][0]",)
+    assert found.undetermined == ("ks[0]",)
     assert np.isinf(found.stderr["ks"][0])
     assert "do not determine ks[0]" in found.message
 

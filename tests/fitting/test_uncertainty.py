@@ -103,7 +103,7 @@ def test_what_is_determined_keeps_its_error_beside_what_is_not():
     alone = jeuler.fit(lambda p: p["ratio"] * X + p["c"] - 3 * X - 1 - WHITE, {"c": 0.0, "ratio": 2.0})
     np.testing.assert_allclose(found.stderr["c"], alone.stderr["c"], rtol=1e-6)
     assert np.isinf(found.stderr["ks"])
-    assert set(found.undetermined) == {"['ks']", "['mass']"}
+    assert set(found.undetermined) == {"ks", "mass"}
     ks, mass = float(found.params["ks"]), float(found.params["mass"])
     slope = np.array([0, 1 / mass, -ks / mass**2])
     np.testing.assert_allclose(np.sqrt(slope @ found.covariance @ slope), alone.stderr["ratio"], rtol=1e-6)

@@ -25,7 +25,7 @@ from jeuler.fitting import fit
 from jeuler.fitting.observations import horizons
 from jeuler.fitting.oscillation import Mode, Oscillation, estimate_oscillation, modes, modes_of
 from jeuler.fitting.spectrum import strong_lines
-from jeuler.fitting.unknowns import Layout, readable
+from jeuler.fitting.unknowns import Layout
 
 STEPS_A_PERIOD, FEWER_STEPS = 80, 40  # FEWER_STEPS where the run would take more than MANY_STEPS in all
 MANY_STEPS = 100_000
@@ -233,7 +233,7 @@ def estimate(
         converged=bool(found.converged),
         message="converged" if found.converged else f"not converged in {len(found.history)} iterations",
         mass=np.asarray(model.masses(found.params)),
-        correlation=None if found.covariance is None else (Layout.of(found.params).names(readable), found.correlation),
+        correlation=None if found.covariance is None else (Layout.of(found.params).names(), found.correlation),
         history=found.history,
     )
 

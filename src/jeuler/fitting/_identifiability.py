@@ -20,7 +20,6 @@ from jeuler.fitting.prediction import compiled_positions
 from jeuler.fitting.recorded import Recorded
 from jeuler.fitting.sampling import fastest
 from jeuler.fitting.uncertainty import directions
-from jeuler.fitting.unknowns import readable
 from jeuler.particles.scene import Scene
 from jeuler.particles.state import ParticleState
 from jeuler.steps.explicit import Step, rk4_step
@@ -154,9 +153,9 @@ def _judged(problem: Any, x: np.ndarray, jacobian: np.ndarray, sigma: float) -> 
         half = d.vectors * np.where(d.seen, 1 / np.where(d.seen, d.values, 1), 0) / d.norms[:, None]
         covariance = sigma**2 * half @ half.T
         is_blind = 1 - np.sum(np.where(d.seen, d.vectors, 0) ** 2, axis=1) > 1e-6
-    blind = describe_blind(d.null(), x, layout.names(readable), np.asarray(problem.lower) >= 0)
+    blind = describe_blind(d.null(), x, layout.names(), np.asarray(problem.lower) >= 0)
     error = np.where(is_blind, np.inf, np.sqrt(np.diag(covariance)))
-    weak = [n for n, e, v in zip(layout.names(readable), error, x, strict=True) if np.isfinite(e) and e > abs(v) > 0]
+    weak = [n for n, e, v in zip(layout.names(), error, x, strict=True) if np.isfinite(e) and e > abs(v) > 0]
     words = [f"nothing would determine {', '.join(blind)}"] if blind else []
     words += [f"errors would be larger than the values of {', '.join(weak[:6])}"] if weak else []
     return Identifiability(

@@ -171,8 +171,8 @@ def fit_springs(
         each has its own initial positions, velocities and anchors where these are ``parameters``; all else is shared.
       parameters: what is free: any of "ks", "kd", "rest_length" (of the scene's springs, or another parameter of its
         forces, or of its effects, such as "coefficient" of a drag or "restitution" of collisions; "forces[1].ks" and
-        "effects[0].restitution" name that of one), "mass" (of the particles that
-        can move), "velocity", "position" (their initial ones) and "anchors" (positions of the pinned particles).
+        "effects[0].restitution" name that of one), "mass" (of the particles that can move), "velocity", "position"
+        (their initial ones) and "anchors" (positions of the pinned particles).
         What cannot be negative by its meaning is fitted from 0 on, 0 included.
       where: a function of the scene that picks further arrays to fit, such as ``lambda scene: scene.forces[1].ks``;
         they are ``params["where"]``.

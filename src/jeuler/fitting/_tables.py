@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jeuler._core.describe import object_table, summary, table, text_table, values_of
+from jeuler.fitting.unknowns import readable
 
 UNITS = {
     "ks": "N/m",
@@ -25,8 +26,8 @@ MOST_ROWS = 20
 
 
 def unit_of(name: str, scene: Any = None) -> str:
-    """The unit of a parameter of a scene: of ``mass``, or of ``forces[1].ks``; empty where it is not known."""
-    *_, field = name.split(".")
+    """The unit of a parameter of a scene: of ``mass``, or of ``forces[1].ks[0]``; empty where it is not known."""
+    *_, field = re.sub(r"(\[[\d, ]+\])+$", "", name).split(".")
     if field == "coefficient" and scene is not None:
         number = re.match(r"forces\[(\d+)\]", name)
         forces = [scene.forces[int(number[1])]] if number else scene.forces
@@ -41,10 +42,8 @@ def parameter_rows(params: Any, stderr: Any, unit: Any = lambda name: "") -> lis
     errors = [None] * len(leaves) if stderr is None else jax.tree.leaves(stderr)
     rows = []
     for (path, value), error in zip(leaves, errors, strict=True):
-        name = jax.tree_util.keystr(path)
-        name = path[0].key if len(path) == 1 and isinstance(path[0], jax.tree_util.DictKey) else name or "parameter"
-        shown = "" if error is None else values_of(np.asarray(error))
-        rows.append((str(name), values_of(np.asarray(value)), shown, unit(str(name))))
+        name, shown = readable(path), "" if error is None else values_of(np.asarray(error))
+        rows.append((name, values_of(np.asarray(value)), shown, unit(name)))
     return rows
 
 

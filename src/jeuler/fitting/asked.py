@@ -44,33 +44,39 @@ class Asked:
     state: State
     task: Task
 
-    def standard_error(self, direction: np.ndarray) -> float:
-        """The error of the sum of ``direction`` times the unknowns, for correlated noise or white, whichever is larger.
+    def errors(self, direction: np.ndarray) -> tuple[float, float]:
+        """The error of the sum of ``direction`` times the unknowns, for correlated noise or white, whichever is larger,
+        and for white noise.
 
             var = c^T A^-1 J^T S J A^-1 c,   A s = c by conjugate gradients
 
         inf where the data do not determine it, or the turns do not suffice.
         """
         if not direction.any():
-            return 0.0
-        change, left = self._solved(direction, np.zeros(len(self.state.residual)), self.loss)
+            return 0.0, 0.0
+        _, change, left = self._solved(direction, np.zeros(len(self.state.residual)), self.loss)
         if not left <= 10 * LEFT:
-            return float(np.inf)
+            return float(np.inf), float(np.inf)
         variance, gamma, noise = self._noise
         series, rows = self._series
-        squares = float(np.sum(change**2)) * variance
+        white = correlated = float(np.sum(change**2)) * variance
         if noise is not None:
             own = float(np.sum(coloured(change[:rows, None], noise, series) ** 2))
             own = own / gamma if self._absolute else own
-            squares = max(squares, own + float(np.sum(change[rows:] ** 2)))
-        return float(np.sqrt(squares))
+            correlated = max(white, own + float(np.sum(change[rows:] ** 2)))
+        return float(np.sqrt(correlated)), float(np.sqrt(white))
 
-    def _solved(self, direction: np.ndarray, z: np.ndarray, loss: str) -> tuple[np.ndarray, float]:
-        """J s with A s = c + J^T z, and what is left, relative; A = J^T diag(curvature of the loss) J."""
+    def follows(self, k: int) -> np.ndarray:
+        """How far all unknowns go with a unit of the k-th one, when they follow it to the least cost: A s = e_k."""
+        s, _, _ = self._solved(np.eye(1, len(self.state.x), k)[0], np.zeros(len(self.state.residual)), self.loss)
+        return s / s[k]
+
+    def _solved(self, direction: np.ndarray, z: np.ndarray, loss: str) -> tuple[np.ndarray, np.ndarray, float]:
+        """s and J s with A s = c + J^T z, and what is left, relative; A = J^T diag(curvature of the loss) J."""
         program = _solution(self.problem.residual)
         curvature = LOSSES[loss].curvature(self.state.residual / float(self.task.spread))
-        change, left = program(self.state.x, self.task, curvature, direction, z)
-        return np.asarray(change, float), float(left)
+        s, change, left = program(self.state.x, self.task, curvature, direction, z)
+        return np.asarray(s, float), np.asarray(change, float), float(left)
 
     @property
     def _absolute(self) -> bool:
@@ -93,7 +99,7 @@ class Asked:
         series, rows = self._series
 
         def left_over(z: np.ndarray) -> np.ndarray:
-            return np.stack([one - self._solved(np.zeros(n), one, "linear")[0] for one in z.T], axis=1)
+            return np.stack([one - self._solved(np.zeros(n), one, "linear")[1] for one in z.T], axis=1)
 
         gamma = autocovariances_by_signs(
             residual, counted, left_over, series, n, fixed=len(residual) - rows, most_lags=LAGS, least=2
@@ -106,11 +112,11 @@ class Asked:
 
 @functools.lru_cache(maxsize=8)
 def _solution(residual: FlatResidual) -> Any:
-    """(x, task, curvature, c, z) -> J s with A s = c + J^T z, and what is left, relative; kept for later."""
+    """(x, task, curvature, c, z) -> s, J s with A s = c + J^T z, and what is left, relative; kept for later."""
     residual = quick_to_compile(residual)
 
     @jax.jit
-    def solved(x: Array, task: Task, curvature: Array, direction: Array, z: Array) -> tuple[Array, Array]:
+    def solved(x: Array, task: Task, curvature: Array, direction: Array, z: Array) -> tuple[Array, ...]:
         def weighted(x: Array) -> Array:
             return jnp.where(task.all_weights > 0, residual(x, task.data) * task.all_weights, 0)
 
@@ -127,7 +133,8 @@ def _solution(residual: FlatResidual) -> Any:
         right = unit * (direction + backwards(z)[0])
         size = jnp.linalg.norm(right)
         s, left = _conjugate_gradients(normal, right / size)
-        return forwards(unit * s) * size, left
+        s = unit * s * size
+        return s, forwards(s), left
 
     return solved
 

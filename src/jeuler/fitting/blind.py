@@ -48,15 +48,17 @@ def _phrase(change: np.ndarray, step: np.ndarray, x: np.ndarray, names: tuple[st
     where = np.flatnonzero(change)
     if len(where) == 1:
         return names[where[0]]
-    words = _together([names[k] for k in where], names)
+    words, s = _together([names[k] for k in where], names), step[where]
+    same = len(where) == 2 and np.isclose(abs(s[0]), abs(s[1]), rtol=1e-2)
+    # of two equal numbers of one array, sum and product are the same to first order: one unit, so it is a sum
+    alike = same and _whole(names[where[0]]) == _whole(names[where[1]])
     if relative[where].all():
         c = change[where] * np.sign(x[where])
         if np.allclose(c, c[0], rtol=1e-2):
             return f"{words} {'only as their ratio' if len(where) == 2 else 'only as their ratios'}"
-        if len(where) == 2 and np.isclose(c[0], -c[1], rtol=1e-2):
+        if len(where) == 2 and np.isclose(c[0], -c[1], rtol=1e-2) and not alike:
             return f"{words} only as their product"
-    s = step[where]
-    if len(where) == 2 and np.isclose(abs(s[0]), abs(s[1]), rtol=1e-2):
+    if same:
         return f"{words} only as their {'difference' if s[0] * s[1] > 0 else 'sum'}"
     order = where[np.argsort(-np.abs(change[where]))][:MOST]
     terms = " ".join(f"{change[k]:+.2g} {names[k]}" for k in order)
@@ -71,7 +73,8 @@ def _together(some: list[str], names: tuple[str, ...]) -> str:
         found.setdefault(_whole(name), []).append(name)
     words: list[str] = []
     for whole, members in found.items():
-        complete = len(members) == sum(_whole(name) == whole for name in names)
+        several = len(found) > 1 or len(members) > MOST  # else the numbers themselves say more
+        complete = several and len(members) == sum(_whole(name) == whole for name in names)
         words += [whole] if complete else members
     if len(words) > MOST:
         words = [*words[:MOST], f"{len(words) - MOST} more"]

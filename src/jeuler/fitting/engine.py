@@ -11,25 +11,27 @@ from jeuler.fitting.beside import attach
 from jeuler.fitting.density import Density
 from jeuler.fitting.descent import by_optax
 from jeuler.fitting.kept import Record
-from jeuler.fitting.least_squares import State, Task
+from jeuler.fitting.least_squares import CONVERGED, ROUNDED, State, Task, advance, start
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.minimise import TUNING, Watch, progress_bar, search
 from jeuler.fitting.observations import variance_of
 from jeuler.fitting.options import Known, Options
-from jeuler.fitting.problem import Problem, programs
-from jeuler.fitting.profiles import AGAIN, Again
+from jeuler.fitting.problem import Problem, marks, programs, variance_of_noise
+from jeuler.fitting.profiles import AGAIN, Again, Ended
 from jeuler.fitting.report import NOT_FINITE, ending, report
 from jeuler.fitting.result import DENSITY, Fit
 from jeuler.fitting.starts import best_start
 
 PyTree = Any
+MOST_ITERATIONS = 200  # of a search with one parameter held
 
 
 class Outcome(NamedTuple):
-    """A fit, and where its search ended; None where that was traced."""
+    """A fit, where its search ended (None where that was traced), and whether the user stopped it."""
 
     fit: Fit
     state: State | None
+    interrupted: bool = False
 
 
 def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Known | None = None) -> Outcome:
@@ -37,7 +39,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
     if problem.traced:
         from jeuler.fitting.traced import run_traced
 
-        return Outcome(run_traced(problem, options), None)
+        return Outcome(run_traced(problem, options, scale), None)
     evaluate, task = programs(problem.residual, problem.data), problem.task(options.tolerance)
     x = np.asarray(problem.x, float)
     known = known or Known(_variance(problem, evaluate, x))
@@ -45,9 +47,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
         from jeuler.fitting.matrix_free import run_matrix_free
 
         return Outcome(*run_matrix_free(problem, options, evaluate, known))
-    record = None
-    if options.resume is not None:
-        record = Record.of(options.resume, task, problem.stages, x, repr(problem.layout.shapes), options.loss)
+    record = Record.of(options.resume, *marks(problem, options, task))
     starts = None
     with progress_bar(options.progress, options.max_iterations * (len(problem.stages) + 1)) as bar:
         watch = Watch(bar, record)
@@ -67,7 +67,10 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
             spread=spread,
             noise=known.noise,
         )
+    held = np.asarray(problem.lower >= problem.upper)
     state = found.state
+    if held.any():  # what is held has no part in the bias of the others
+        state = state._replace(jacobian=np.where(held, 0, state.jacobian), scale=np.where(held, 0, state.scale))
     if not np.isfinite(state.cost):
         raise ValueError(NOT_FINITE)
     words = ending(state, watch)
@@ -76,7 +79,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
         task = task._replace(spread=np.asarray(found.spread))
         attach(fit, AGAIN, _again(problem, evaluate, options.loss, task, state, fit))
     attach(fit, DENSITY, Density.of(problem, options.loss, state.residual, found.spread))
-    return Outcome(fit, state)
+    return Outcome(fit, state, watch.interrupted)
 
 
 def _variance(problem: Problem, evaluate: Any, x: np.ndarray) -> float | None:
@@ -101,6 +104,15 @@ def _variance(problem: Problem, evaluate: Any, x: np.ndarray) -> float | None:
 def _again(problem: Problem, evaluate: Any, loss: str, task: Task, state: State, fit: Fit) -> Again:
     """What a profile needs of this fit."""
     error, white = (np.asarray(problem.layout.vector(e), float) for e in (fit.stderr, fit.stderr_white))
-    freedom = max(int(np.sum(task.all_weights > 0)) - len(state.x), 1)
-    variance = 1.0 if problem.absolute else float(np.sum(np.asarray(state.residual) ** 2)) / freedom
-    return Again(problem.layout, evaluate, LOSSES[loss], task, state, error, white, max(variance, 1e-300))
+
+    def search(task: Task, x: np.ndarray) -> Ended:
+        with np.errstate(all="ignore"):
+            fresh = start(x, len(state.residual), MOST_ITERATIONS)
+            found = advance(evaluate, LOSSES[loss], fresh, task, 1_000_000)
+        return Ended(found.x, float(found.cost), bool(found.status in (CONVERGED, ROUNDED)))
+
+    def follows(k: int) -> np.ndarray:
+        return np.eye(1, len(state.x), k)[0]
+
+    variance = variance_of_noise(problem, task, state)
+    return Again(problem.layout, task, state.x, search, lambda k: (error[k], white[k]), follows, variance)

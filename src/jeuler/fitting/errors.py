@@ -12,7 +12,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler.fitting.asked import ASKED
 from jeuler.fitting.beside import attached
-from jeuler.fitting.unknowns import Layout, readable
+from jeuler.fitting.unknowns import Layout
 
 BLIND = "blind directions"  # under this name those of the params, (n, k), are kept beside a result
 SEEN = 1e-5  # of a change along one of them: less is rounding
@@ -26,7 +26,7 @@ def error_of(found: Any, of: str | Callable[[Any], Any]) -> float:
         raise ValueError("standard_error needs the fit as `fit` gave it, with values, uninterrupted; fit again")
     direction = _of_name(layout, of) if isinstance(of, str) else _of_function(layout, found.params, of)
     if found.covariance is None:
-        return float(asked.standard_error(direction))
+        return float(asked.errors(direction)[0])
     error = np.asarray(layout.vector(found.stderr), float)
     if isinstance(of, str):
         return float(error[np.argmax(direction)])
@@ -39,11 +39,7 @@ def error_of(found: Any, of: str | Callable[[Any], Any]) -> float:
 
 
 def _of_name(layout: Layout, name: str) -> np.ndarray:
-    names, plain = layout.names(readable), layout.names()
-    if name not in names and name not in plain:
-        some = ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-        raise ValueError(f"of must name a parameter, one of {some}, or be a function of the params, got {name!r}")
-    return np.eye(1, len(names), (names if name in names else plain).index(name))[0]
+    return np.eye(1, layout.size, layout.place(name, "of", ", or a function of the params"))[0]
 
 
 def _of_function(layout: Layout, params: Any, of: Any) -> np.ndarray:

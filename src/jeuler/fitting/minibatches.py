@@ -4,102 +4,68 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jeuler.fitting.descent import GOES_ON, STILL, Descent, Place
 from jeuler.fitting.problem import Problem
 
 PATIENCE = 50  # passes over the data without a decrease after which the loss stands still
 
 
-class Minibatches:
-    """A descent whose steps look at some rows of the data each; all of them are looked at after each pass.
+def by_minibatches(descent: Descent, problem: Problem, size: int, x: np.ndarray, max_iterations: int) -> Place:
+    """A descent whose steps look at some rows of the data each; all of them are looked at after each pass."""
+    rows, data, everything = _rows_of(problem, size), problem.data, descent.task
+    weights, scale, residual = np.asarray(problem.weights, float), jnp.asarray(descent.unit), problem.residual
+    ends, passes = np.cumsum([math.prod(s) for s in problem.form.shapes if s is not None]), -(-rows // size)
 
-    Attributes:
-      history, nonfinite, still: as in `Descent`, which counts them.
-    """
+    def losses(z, data, weights, index):
+        some = jax.tree.map(lambda a: jnp.asarray(a)[index], data)
+        own = [w.reshape(rows, -1)[index].ravel() for w in jnp.split(weights, ends[:-1])]
+        weight = jnp.concatenate(own)
+        loss = jnp.sum(jnp.where(weight > 0, residual(z * scale, some) * weight, 0) ** 2)
+        loss = loss / jnp.maximum(jnp.sum(weight > 0), 1)
+        return loss, loss
 
-    def __init__(self, descent: Any, problem: Problem, size: int):
-        self.descent: Any = descent
-        self.data: Any = problem.data
-        self.weights: Any = np.asarray(problem.weights, float)
-        self.size: int = size
-        self.rows: int = _rows_of(problem, size)
-        rows, scale, residual = self.rows, jnp.asarray(descent.unit), problem.residual
-        shapes = [shape for shape in problem.form.shapes if shape is not None]
-        ends = np.cumsum([math.prod(shape) for shape in shapes])
+    value_and_grad = jax.jit(jax.value_and_grad(losses, has_aux=True))
+    propose = jax.jit(functools.partial(descent.propose, losses))
 
-        def losses(z, data, weights, index):
-            some = jax.tree.map(lambda a: jnp.asarray(a)[index], data)
-            own = [w.reshape(rows, -1)[index].ravel() for w in jnp.split(weights, ends[:-1])]
-            weight = jnp.concatenate(own)
-            loss = jnp.sum(jnp.where(weight > 0, residual(z * scale, some) * weight, 0) ** 2)
-            loss = loss / jnp.maximum(jnp.sum(weight > 0), 1)
-            return loss, loss
-
-        self._value_and_grad = jax.jit(jax.value_and_grad(losses, has_aux=True))
-        self._propose = jax.jit(functools.partial(descent.propose, losses))
-
-    @property
-    def history(self) -> list[float]:
-        return self.descent.history
-
-    @property
-    def nonfinite(self) -> int:
-        return self.descent.nonfinite
-
-    @property
-    def still(self) -> bool:
-        return self.descent.still
-
-    def run(self, x: np.ndarray, stages: Sequence[np.ndarray], max_iterations: int) -> np.ndarray:
-        """Passes over the data: the best point over everything after one of them."""
-        descent, passes = self.descent, -(-self.rows // self.size)
-        weights, draw = self.weights, np.random.default_rng(0)
-        z = jnp.asarray(x / descent.unit)
-        descent.best, descent.least = z, np.inf
-        state, damping, since, order = descent.init(z), 1.0, 0, np.zeros(0, int)
-        try:
-            for n in range(max_iterations):
-                if n % passes == 0:
-                    before = descent.least
-                    if not self._look(z):
-                        if not np.isfinite(descent.least):
-                            break
-                        z, state, damping = descent.best, descent.init(descent.best), damping / 2
-                    since = 0 if descent.least < (1 - descent.tolerance) * before else since + 1
-                    descent.still = descent.least == 0.0 or since >= PATIENCE
-                    if descent.still:
-                        break
-                    order = np.resize(draw.permutation(self.rows), passes * self.size)
-                index = order[n % passes * self.size :][: self.size]
-                (loss, _), gradient = self._value_and_grad(z, self.data, weights, index)
-                if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-                    descent.nonfinite += 1
-                    z, state, damping = descent.best, descent.init(descent.best), damping / 2
-                    continue
-                z, state = self._propose(z, state, loss, gradient, damping, self.data, weights, index)
-            if not descent.still:
-                self._look(z)
-        except KeyboardInterrupt:
-            if not descent.history:
-                raise
-            descent.watch.interrupted = True
-        return np.asarray(descent.best, float) * descent.unit
-
-    def _look(self, z: Any) -> bool:
-        """Whether the loss over everything is finite; it is counted then."""
-        weights = self.descent.task.all_weights
-        total = float(self.descent.losses(z, self.descent.task.data, weights, weights)[1])
+    def look(place: Place) -> tuple[Place, list[float]]:
+        own = everything.all_weights
+        total = float(descent.losses(place.z, everything.data, own, own)[1])
         if not np.isfinite(total):
-            self.descent.nonfinite += 1
-            return False
-        self.descent.count(z, total)
-        return True
+            return place.stepped_back(descent.init, place.best_of_all, place.least_of_all), []
+        return place.looked_at(total), [total]
+
+    def iterate(place: Place) -> tuple[Place, list[float]]:
+        seen: list[float] = []
+        turn, part = divmod(place.turns, passes)
+        if part == 0:
+            before = place.least_of_all
+            place, seen = look(place)
+            less = place.least_of_all < (1 - descent.tolerance) * before
+            place = place._replace(since=0 if less else place.since + 1)
+            if place.status == GOES_ON and (place.least_of_all == 0.0 or place.since >= PATIENCE):
+                place = place._replace(status=STILL)
+            if place.status != GOES_ON:
+                return place, seen
+        order = np.resize(np.random.default_rng([0, turn]).permutation(rows), passes * size)
+        index = order[part * size :][:size]
+        (loss, _), gradient = value_and_grad(place.z, data, weights, index)
+        place = place._replace(turns=place.turns + 1)
+        if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+            return place.stepped_back(descent.init, place.best_of_all, place.least_of_all), seen
+        z, state = propose(place.z, place.state, loss, gradient, place.damping, data, weights, index)
+        return place._replace(z=z, state=state), seen
+
+    _, place = descent.beginning(x)
+    place = descent.follow(place, 0, max_iterations, iterate)
+    if place.status == GOES_ON and not descent.watch.interrupted:
+        place, seen = look(place)
+        descent.history += seen
+    return place
 
 
 def _rows_of(problem: Problem, size: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jeuler.fitting import least_squares
 from jeuler.fitting.evaluate import Evaluate
-from jeuler.fitting.kept import Record
+from jeuler.fitting.kept import SEARCH, Record
 from jeuler.fitting.least_squares import State, Task, again, start
 from jeuler.fitting.losses import LOSSES, Loss
 
@@ -35,11 +35,14 @@ class Watch:
     bar: Any
     record: Record | None = None
     interrupted: bool = False
+    part: str = SEARCH
 
     def follow(self, advance: Callable[[Any], Any], state: Any, most: int, stage: int, history: list[float]) -> Any:
         """One search to its end, or to where it is interrupted; ``advance`` makes one step of it, taken or not."""
         try:
             while state.status == least_squares.RUNNING and state.iterations < most:
+                if self.interrupted and np.isfinite(state.cost):
+                    break  # among the starts: the best of them has been evaluated
                 before = state.iterations
                 state = advance(state)
                 counted = bool(state.iterations > before)
@@ -55,8 +58,8 @@ class Watch:
         if counted:
             self.bar.update()
             self.bar.set_postfix_str(f"loss {history[-1]:.4g}" if history else "", refresh=False)
-        if self.record is not None:
-            self.record.save(stage, state, history)
+        if self.record is not None and not self.interrupted:
+            self.record.save(stage, state, history, self.part)
 
 
 @dataclasses.dataclass
@@ -93,7 +96,7 @@ def search(
     plan += [(squares, task.all_weights, task.tolerance if not robust else ROUGH), *robust]
     state, first = start(x, len(task.weights), max_iterations), 0
     history: list[float] = []
-    if watch.record is not None and (kept := watch.record.load(State)) is not None:
+    if watch.record is not None and (kept := watch.record.load(state)) is not None:
         first, state, history = kept
     bend = 1.0
     for number, (own_loss, weights, tolerance) in enumerate(plan):

@@ -42,9 +42,8 @@ class Options:
                     "minibatch is for an optax optimiser; leave it out, or pass optimizer=optax.adam(0.01)"
                 )
         if self.optimizer is not None:
-            for name in ("starts", "resume"):
-                if getattr(self, name) is not None:
-                    raise ValueError(f"{name} is for Levenberg-Marquardt; leave it out, or leave optimizer out")
+            if self.starts is not None:
+                raise ValueError("starts is for Levenberg-Marquardt; leave it out, or leave optimizer out")
             if self.loss != "linear":
                 raise ValueError('loss must be "linear" with an optax optimiser; put the loss into the residual')
 

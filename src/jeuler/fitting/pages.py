@@ -9,7 +9,7 @@ import numpy as np
 
 from jeuler.fitting._tables import unit_of
 from jeuler.fitting.beside import attached
-from jeuler.fitting.unknowns import Layout, readable
+from jeuler.fitting.unknowns import Layout
 from jeuler.forces import Springs
 
 if TYPE_CHECKING:
@@ -63,13 +63,11 @@ def _rows(found: SpringFit) -> Iterator[Parameter]:
     errors = [None] * len(values) if found.stderr is None else np.asarray(layout.vector(found.stderr), float)
     bias = [None] * len(values) if found.step_bias is None else np.asarray(layout.vector(found.step_bias), float)
     bounded = set(found.at_bound)
-    for name, plain, value, error, shift in zip(
-        layout.names(readable), layout.names(), values, errors, bias, strict=True
-    ):
-        notes = ["ended on a bound"] if plain in bounded else []
+    for name, value, error, shift in zip(layout.names(), values, errors, bias, strict=True):
+        notes = ["ended on a bound"] if name in bounded else []
         if shift is not None and error and np.isfinite(error) and abs(shift) > 0.1 * error:
             notes.append(f"the step's own error moves it by {shift:.2g}")
-        yield Parameter(name, value, error, unit_of(name.split("[")[0], found.scene), "; ".join(notes))
+        yield Parameter(name, value, error, unit_of(name, found.scene), "; ".join(notes))
 
 
 def _whose(kind: Series, several: int) -> str:

@@ -18,6 +18,7 @@ from jeuler._core.partition import OfArrays, arrays_only
 from jeuler._jax.programs import is_transformed
 from jeuler.fitting.evaluate import Evaluate, evaluations
 from jeuler.fitting.least_squares import Task
+from jeuler.fitting.options import Options
 from jeuler.fitting.priors import Alike, Priors
 from jeuler.fitting.unknowns import Layout, checked_bounds
 
@@ -218,6 +219,21 @@ class Problem:
             own = [np.asarray(a, float) for a in (self.weights, self.weights, self.lower, self.upper)]
             rest = [np.asarray(a, float) for a in (1.0, tolerance, self.precision, 0.0)]
         return Task(self.data, *own, *rest)
+
+
+def marks(problem: Problem, options: Options, task: Task) -> tuple[Any, ...]:
+    """By what a file knows that it is of this fit."""
+    windows = () if problem.windows is None else problem.windows.data
+    how = (options.loss, options.loss_scale, options.starts, options.minibatch, options.max_iterations)
+    return task, problem.stages, np.asarray(problem.x), repr(problem.layout.shapes), how, windows
+
+
+def variance_of_noise(problem: Problem, task: Task, state: Any) -> float:
+    """That of a weighted residual: 1 where sigma is given, or what the best fit leaves over, per degree of freedom."""
+    if problem.absolute:
+        return 1.0
+    freedom = max(int(np.sum(np.asarray(task.all_weights) > 0)) - len(state.x), 1)
+    return max(float(np.sum(np.asarray(state.residual) ** 2)) / freedom, 1e-300)
 
 
 def _joined(a: Any, b: Any) -> Any:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jeuler.fitting import least_squares
-from jeuler.fitting.evaluate import Evaluate
-from jeuler.fitting.least_squares import State, Task
-from jeuler.fitting.losses import Loss
-
 if TYPE_CHECKING:
+    from jeuler.fitting.least_squares import Task
     from jeuler.fitting.unknowns import Layout
 
 MOST_TRIES = 20
@@ -29,6 +27,8 @@ class Profile(NamedTuple):
       lower, upper: where the others can no longer make up for it; -inf or inf where they always can, or the bound.
       values: of the parameter, in order, (point,).
       distances: how far each is from the best fit, in standard errors: the signed root of the loss's rise.
+      converged: whether both ends are what they are said to be: each search of the others converged, and none found
+        a loss below that of the fit.
     """
 
     name: str
@@ -37,70 +37,99 @@ class Profile(NamedTuple):
     upper: float
     values: np.ndarray
     distances: np.ndarray
+    converged: bool
+
+
+class Ended(NamedTuple):
+    """Where a search with one parameter held ended."""
+
+    x: np.ndarray
+    cost: float
+    converged: bool
 
 
 @dataclasses.dataclass(frozen=True)
 class Again:
-    """What a fit needs to search once more with one parameter held: kept beside a result (`jeuler.fitting.beside`)."""
+    """What a fit needs to search once more with one parameter held: kept beside a result (`jeuler.fitting.beside`).
+
+    Attributes:
+      task: of the whole data, with the bounds of all parameters.
+      x: the best of the fit.
+      search: from a task and a start to where the others end.
+      errors: of the k-th parameter, for correlated noise and for white.
+      follows: how far the others go with a unit of the k-th one, by the linear model, (n,).
+      variance: of the weighted noise.
+    """
 
     layout: Layout
-    evaluate: Evaluate
-    loss: Loss
     task: Task
-    state: State
-    error: np.ndarray
-    white: np.ndarray
+    x: np.ndarray
+    search: Callable[[Task, np.ndarray], Ended]
+    errors: Callable[[int], tuple[float, float]]
+    follows: Callable[[int], np.ndarray]
     variance: float
+
+    @functools.cached_property
+    def best(self) -> Ended:
+        """The minimum itself, as near as the searches with one parameter held come to theirs."""
+        return self.search(self.task, self.x)
 
     def profile(self, name: str, z: float) -> Profile:
         """The interval out to z standard errors."""
-        from jeuler.fitting.unknowns import readable
-
-        names, plain = self.layout.names(readable), self.layout.names()
-        if name not in names and name not in plain:
-            raise ValueError(f"name must be one of {', '.join(names[:8])}{' ...' * (len(names) > 8)}, got {name!r}")
-        k = names.index(name) if name in names else plain.index(name)
-        points = {float(self.state.x[k]): 0.0}
-        lower, upper = (self._end(k, side, z, points) for side in (-1, 1))
+        k = self.layout.place(name, "name")
+        value, (error, white) = float(self.best.x[k]), self.errors(k)
+        points, told = {value: 0.0}, [True]
+        seen = np.isfinite(error) and error > 0
+        line = _Line(self, k, z, error, error / white if seen and white > 0 else 1.0, self.follows(k) if seen else None)
+        lower, upper = (line.end(side, points, told) for side in (-1, 1))
         values = np.array(sorted(points))
-        return Profile(name, float(self.state.x[k]), lower, upper, values, np.array([points[v] for v in values]))
+        return Profile(name, value, lower, upper, values, np.array([points[v] for v in values]), all(told))
 
-    def _end(self, k: int, side: int, z: float, points: dict[float, float]) -> float:
+
+class _Line(NamedTuple):
+    """The way of one parameter."""
+
+    again: Again
+    k: int
+    z: float
+    error: float
+    wider: float  # than for white noise
+    follows: np.ndarray | None  # None where the data do not determine it
+
+    def end(self, side: int, points: dict[float, float], told: list[bool]) -> float:
         """Where the distance reaches z on one side, by the secant rule: the root of the rise is nearly a line."""
-        best, error = float(self.state.x[k]), float(self.error[k])
-        bound = float((self.task.lower if side < 0 else self.task.upper)[k])
-        if not np.isfinite(error) or error <= 0:
+        best, task = float(self.again.best.x[self.k]), self.again.task
+        bound = float((task.lower if side < 0 else task.upper)[self.k])
+        if self.follows is None:
             return bound if np.isfinite(bound) else side * np.inf
-        state, previous, reach = self.state, (best, 0.0), best + side * z * error
+        near, previous, reach = self.again.best.x, (best, 0.0), best + side * self.z * self.error
         for _ in range(MOST_TRIES):
-            at = max(reach, bound) if side < 0 else min(reach, bound)
-            state, distance = self._held(k, at, state)
-            points[at] = side * distance
-            if abs(distance - z) < NEAR:
+            at = float(max(reach, bound) if side < 0 else min(reach, bound))
+            found, distance = self._held(at, near)
+            near, points[at] = found.x, side * distance
+            if abs(distance - self.z) < NEAR or (at == bound and distance < self.z):
+                told.append(found.converged)
                 return at
-            if at == bound and distance < z:
-                return bound
             slope = (distance - previous[1]) / (at - previous[0])
             if not np.isfinite(distance) or slope * side <= 0:
                 reach = (at + previous[0]) / 2 if not np.isfinite(distance) else at + (at - best)
             else:
-                reach = at + float(np.clip((z - distance) / slope, -2 * abs(at - best), 2 * abs(at - best)))
+                reach = at + float(np.clip((self.z - distance) / slope, -2 * abs(at - best), 2 * abs(at - best)))
             if np.isfinite(distance):
                 previous = (at, distance)
-            if abs(reach - best) > 1e6 * error:
+            if abs(reach - best) > 1e6 * self.error:
                 return side * np.inf
+        told.append(False)
         return reach
 
-    def _held(self, k: int, value: float, near: State) -> tuple[State, float]:
-        """The best of the others with one parameter held at a value, and the distance in standard errors."""
-        hold = np.arange(len(near.x)) == k
-        task = self.task._replace(
-            lower=np.where(hold, value, self.task.lower), upper=np.where(hold, value, self.task.upper)
+    def _held(self, value: float, near: np.ndarray) -> tuple[Ended, float]:
+        """The best of the others with the parameter held at a value, and the distance in standard errors."""
+        again, hold = self.again, np.arange(len(near)) == self.k
+        task = again.task._replace(
+            lower=np.where(hold, value, again.task.lower), upper=np.where(hold, value, again.task.upper)
         )
-        x = np.where(hold, value, near.x)
-        with np.errstate(all="ignore"):
-            fresh = least_squares.start(x, len(near.residual), 200)
-            state = least_squares.advance(self.evaluate, self.loss, fresh, task, 1_000_000)
-        rise = max(float(state.cost - self.state.cost), 0.0)
-        wider = float(self.error[k] / self.white[k]) if self.white[k] > 0 else 1.0
-        return state, float(np.sqrt(rise / self.variance)) / wider
+        x = np.clip(near + (value - near[self.k]) * self.follows, task.lower, task.upper)
+        found = again.search(task, x)
+        rise = (found.cost - again.best.cost) / again.variance
+        honest = found.converged and again.best.converged and rise > -NEAR
+        return found._replace(converged=honest), float(np.sqrt(max(rise, 0.0))) / self.wider

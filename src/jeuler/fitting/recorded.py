@@ -34,7 +34,7 @@ from jeuler.fitting.series import Columns, Series, column_names
 from jeuler.fitting.smoothness import alike_neighbours
 from jeuler.fitting.step_bias import RANDOM, bias_of_many, bias_of_step
 from jeuler.fitting.two_starts import from_both
-from jeuler.fitting.unknowns import Layout
+from jeuler.fitting.unknowns import Layout, size_of
 from jeuler.fitting.weak_form import weak_form
 from jeuler.fitting.windows import in_windows
 from jeuler.particles.fields import draws
@@ -89,7 +89,6 @@ class Recorded:
             if checks.is_traced(value):
                 raise ValueError(f"{name} must be a value, got a traced one; only positions and parameters are traced")
         times, targets = checked_observations(times, positions, state.position.shape, float(t0))
-        _refuse_stillness(targets)
         if dt > times[-1] - t0 and times[-1] > t0:
             raise ValueError(
                 f"dt must be at most the span of the times, {times[-1] - t0:g} s from t0={t0:g} s, got {dt:g} s; "
@@ -190,13 +189,14 @@ class Recorded:
         window: int | None = None,
     ) -> tuple[Outcome, str]:
         """Search from the data and, where that is not good, from the scene's values; the better, and its start."""
+        _refuse_stillness(self.targets)
         stages = self._stages() if grow and options.minibatch is None else ()
         alike = alike_neighbours(self.scene, self.prediction.places, smoothness)
         given = self.problem(self.start, bounds, sigma, weights, stages, priors, options.loss, alike)
         if options.minibatch is not None:
             given = dataclasses.replace(given, windows=in_windows(given, self, window))
         if self.traced:
-            return run(given, options), "given"
+            return run(given, options, scale=jax.tree.map(size_of, self.start)), "given"
         known, scale = self._known(given), self._scale()
         begun = self._from_data(given) if start == "data" else None
         return from_both(given, begun, options, scale, known)
@@ -231,11 +231,7 @@ class Recorded:
         """A sensible step of each parameter, for an optax optimiser."""
         amplitude, speed = amplitude_of(self.targets), speed_of(self.times, self.targets)
         sizes = {"velocity": speed, "position": amplitude, "anchors": amplitude}
-
-        def size(x: Any) -> Any:
-            return np.where(np.asarray(x) != 0, np.abs(np.asarray(x, float)), 1.0)
-
-        return {name: sizes[name] if name in sizes else jax.tree.map(size, x) for name, x in self.start.items()}
+        return {name: sizes[name] if name in sizes else jax.tree.map(size_of, x) for name, x in self.start.items()}
 
     def seen_whole(self, values: Any) -> Recorded:
         """The same with what was held out, to be shown."""
@@ -281,10 +277,10 @@ class Recorded:
 
 
 def _refuse_stillness(targets: Any) -> None:
-    """Positions that never change say nothing, unless they are the placeholder zeros of a question before the data."""
+    """One ValueError for positions that never change: they say nothing."""
     if checks.is_traced(targets):
         return
     seen = np.isfinite(targets)
     first = np.where(seen, targets, 0)[np.argmax(seen, axis=0), *np.indices(seen.shape[1:])]
-    if seen.any() and np.any(first[seen.any(axis=0)]) and np.all(np.where(seen, targets, first) == first):
+    if seen.any() and np.all(np.where(seen, targets, first) == first):
         raise ValueError("positions must move, got the same ones at all times; give a recording of a motion")

@@ -19,7 +19,7 @@ from jeuler.fitting.options import Known
 from jeuler.fitting.problem import MOST_COLUMNS, Problem, series_of
 from jeuler.fitting.result import Fit, Verdict
 from jeuler.fitting.uncertainty import Uncertainty, uncertainty
-from jeuler.fitting.unknowns import Layout, readable
+from jeuler.fitting.unknowns import Layout
 
 INVERSE = "inverse"  # under this name that of J^T J is kept beside a result of many unknowns
 NOT_FINITE = (
@@ -70,11 +70,11 @@ def report(
         ending=words,
         nonfinite=int(state.nonfinite),
         blind=errors.blind,
-        at_bound=tuple(np.asarray(layout.names(readable))[held]),
+        at_bound=tuple(np.asarray(layout.names())[held].tolist()),
         unresolved=errors.unresolved,
         correlated=errors.correlated,
         sigma_given=problem.absolute,
-        more=(*apart, *known.more, *_few(size, len(x)), *_kept(layout)),
+        more=(*apart, *known.more, *_few(size, len(x), problem.absolute), *_kept(layout)),
         **quality,
     )
     fit = Fit(
@@ -90,7 +90,7 @@ def report(
         stderr_white=errors.white,
         residual=problem.of_data(np.asarray(state.residual)),
         blind=errors.blind,
-        at_bound=tuple(np.asarray(layout.names())[held]),
+        at_bound=verdict.at_bound,
         starts=starts,
         **quality,
     )
@@ -118,33 +118,44 @@ def _errors(problem: Problem, state: State, spread: float, loss: str) -> _Errors
     """The errors of a search with values in hand."""
     if not (state.jacobian.size and np.isfinite(state.jacobian).all()):
         return _Errors()
-    layout, x = problem.layout, np.asarray(state.x)
+    layout, x, names = problem.layout, np.asarray(state.x), np.asarray(problem.layout.names())
+    free = problem.lower < problem.upper  # the others are held where they are, without an error
+    some = state if free.all() else state._replace(x=x[free], jacobian=state.jacobian[:, free])
     with np.errstate(all="ignore"):
-        found = errors_of(problem, state, spread, loss)
-        error, white = (
-            np.where(found.blind, np.inf, np.sqrt(np.maximum(np.diag(c), 0))) for c in (found.covariance, found.white)
-        )
+        found = errors_of(problem, some, spread, loss)
+        error, white = np.zeros((2, len(x)))
+        for each, c in ((error, found.covariance), (white, found.white)):
+            each[free] = np.where(found.blind, np.inf, np.sqrt(np.maximum(np.diag(c), 0)))
         null = found.directions.null()
-        blind = describe_blind(null, x, layout.names(readable), np.asarray(problem.lower) >= 0)
-    doubtful = (problem.lower == 0) & (x > 0) & (error > x) & ~found.blind
+        blind = describe_blind(null, x[free], tuple(names[free]), np.asarray(problem.lower)[free] >= 0)
+    doubtful = (problem.lower == 0) & (x > 0) & (error > x) & np.isfinite(error)
     return _Errors(
         stderr=layout.params(error),
         white=layout.params(white),
-        covariance=found.covariance,
-        undetermined=tuple(name for name, out in zip(layout.names(), found.blind, strict=True) if out),
+        covariance=_with_held(found.covariance, free, free),
+        undetermined=tuple(names[free][found.blind].tolist()),
         blind=blind,
-        unresolved=tuple(np.asarray(layout.names(readable))[doubtful]),
+        unresolved=tuple(names[doubtful].tolist()),
         autocorrelation=float(found.autocorrelation) if np.isfinite(found.autocorrelation) else None,
         correlated=bool(np.any(found.covariance != found.white)),
-        inverse=found.inverse,
-        null=null,
+        inverse=None if found.inverse is None else _with_held(found.inverse, free, free),
+        null=_with_held(null, free, np.ones(null.shape[1], bool)),
     )
 
 
-def _few(count: int, unknowns: int) -> tuple[str, ...]:
+def _with_held(some: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """A matrix of what is free with zeros for what is held."""
+    whole = np.zeros((len(rows), len(columns)))
+    whole[np.ix_(rows, columns)] = some
+    return whole
+
+
+def _few(count: int, unknowns: int, absolute: bool) -> tuple[str, ...]:
     """A word where hardly more is known than is asked."""
     if unknowns < count < 2 * unknowns:
         return (f"there are only {count} data for {unknowns} parameters: the errors are guesses; record more",)
+    if count <= unknowns and not absolute:
+        return (f"there are only {count} data for {unknowns} parameters: no errors without sigma; record more",)
     return ()
 
 

@@ -53,7 +53,7 @@ class Fit:
       >>> {name: round(float(value), 3) for name, value in found.params.items()}
       {'slope': 3.0, 'unused': 5.0}
       >>> found.converged, found.undetermined, float(found.stderr["unused"])
-      (True, ("['unused']",), inf)
+      (True, ('unused',), inf)
     """
 
     params: PyTree
@@ -85,8 +85,10 @@ class Fit:
         Args:
           name: of the parameter: "k", or "ks[3]" for one number of an array.
           level: probability of the interval.
-        Returns: `Profile`, with ``.lower`` and ``.upper``; infinite, or the bound, where nothing stops it.
-        Raises: ValueError, if there is no such parameter, or the fit was copied, traced or has no errors.
+        Returns: `Profile`, with ``.lower`` and ``.upper``; infinite, or the bound, where nothing stops it. Its
+          ``.converged`` says whether each end was found.
+        Raises: ValueError, if there is no such parameter, or the fit was copied, traced, interrupted or made by an
+          optax optimiser.
         Example:
           >>> import jax.numpy as jnp, jeuler
           >>> x = jnp.linspace(0.0, 1.0, 11)
@@ -101,7 +103,10 @@ class Fit:
             raise ValueError(f"level must lie between 0 and 1, got {level!r}")
         again = attached(self, AGAIN)
         if again is None:
-            raise ValueError("a profile needs the fit as `fit` gave it, with standard errors; fit again")
+            raise ValueError(
+                "a profile needs the fit as `fit` or `fit_springs` gave it by Levenberg-Marquardt, uninterrupted; a "
+                "copy, and what comes out of jit or vmap, has none; fit again"
+            )
         return again.profile(name, float(norm.ppf((1 + level) / 2)))
 
     def log_density(self, params: PyTree) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from jeuler._core import checks
 from jeuler.fitting import least_squares
 from jeuler.fitting.evaluate import Evaluate
+from jeuler.fitting.kept import STARTS
 from jeuler.fitting.least_squares import State, Task, start
 from jeuler.fitting.losses import LOSSES, Loss
 from jeuler.fitting.minimise import Watch
@@ -33,6 +34,8 @@ def best_start(
             norms = np.asarray(least_squares.column_norms(np.asarray(jacobian, float)))
             return np.linalg.norm(np.asarray(r, float)) / norms
 
+    if watch.record is not None and watch.record.all_ends is not None:
+        return best_of(problem, *watch.record.all_ends)
     xs = starts_of(problem.layout, options, x, task, reach)
     at_once = max(1, min(len(xs), JACOBIAN_BYTES // 4 // (8 * m * n)))
     states = many_starts(
@@ -44,7 +47,10 @@ def best_start(
         watch=watch,
         at_once=at_once,
     )
-    return best_of(problem, states)
+    ends = np.stack([state.x for state in states]), np.array([float(state.total) for state in states])
+    if watch.record is not None:
+        watch.record.ends = ends
+    return best_of(problem, *ends)
 
 
 def starts_of(layout: Layout, options: Options, x: np.ndarray, task: Task, reach: Callable[[], Any]) -> np.ndarray:
@@ -56,14 +62,14 @@ def starts_of(layout: Layout, options: Options, x: np.ndarray, task: Task, reach
     return np.asarray(np.clip(np.stack(xs), task.lower, task.upper))
 
 
-def best_of(problem: Problem, states: Sequence[Any]) -> tuple[np.ndarray, dict[str, Any]]:
+def best_of(problem: Problem, xs: np.ndarray, totals: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
     """Where the best of some searches ended, and all of them."""
     size = max(int(np.sum(np.asarray(problem.weights) > 0)), 1)
-    losses = np.array([state.total / size for state in states])
+    losses = totals / size
     if not np.isfinite(losses).any():
         raise ValueError(NOT_FINITE)
-    every = jax.tree.map(lambda *a: jnp.stack(a), *[problem.layout.params(jnp.asarray(s.x)) for s in states])
-    return states[int(np.nanargmin(losses))].x, {"params": every, "loss": losses}
+    every = jax.tree.map(lambda *a: jnp.stack(a), *[problem.layout.params(jnp.asarray(x)) for x in xs])
+    return xs[int(np.nanargmin(losses))], {"params": every, "loss": losses}
 
 
 def _count_of(starts: Any, layout: Layout) -> int:
@@ -102,11 +108,13 @@ def many_starts(
     """A search from each of the starts; their residuals and Jacobians are evaluated ``at_once`` by one program."""
     batched = jax.jit(jax.vmap(both, in_axes=(0, None)))
     states = [start(x, len(task.weights), max_iterations) for x in xs]
+    if watch.record is not None and (kept := watch.record.load(states, STARTS)) is not None:
+        states = kept[1]
 
     def goes_on(state: State) -> bool:
         return bool(state.status == least_squares.RUNNING and state.iterations < max_iterations)
 
-    while running := [k for k, state in enumerate(states) if goes_on(state)]:
+    def turn(running: list[int]) -> None:
         for first in range(0, len(running), at_once):
             some = running[first : first + at_once]
             filled = [*some, *some[:1] * (at_once - len(some))]
@@ -116,7 +124,17 @@ def many_starts(
                 known = _known(values[place], jacobians[place])
                 with np.errstate(all="ignore"):
                     states[k] = least_squares.advance(known, loss, states[k], task, states[k].evaluations + 1)
-        watch.bar.update()
+
+    try:
+        while running := [k for k, state in enumerate(states) if goes_on(state)]:
+            turn(running)
+            watch.bar.update()
+            if watch.record is not None:
+                watch.record.save(0, states, [], STARTS)
+    except KeyboardInterrupt:
+        if not any(np.isfinite(state.cost) for state in states):
+            raise
+        watch.interrupted = True
     return states
 
 

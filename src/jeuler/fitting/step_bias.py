@@ -15,9 +15,10 @@ from jeuler.fitting.forward import Forward
 from jeuler.fitting.least_squares import State
 from jeuler.fitting.matrix_free import products
 from jeuler.fitting.prediction import compiled_positions, recording
+from jeuler.fitting.problem import variance_of_noise
 from jeuler.fitting.report import INVERSE
 from jeuler.fitting.result import Fit
-from jeuler.fitting.unknowns import Layout, readable
+from jeuler.fitting.unknowns import Layout
 
 if TYPE_CHECKING:
     from jeuler.fitting.recorded import Recorded
@@ -64,7 +65,7 @@ def shifted(
     if not share.size or share[worst] <= TENTH:
         return bias, []
     return bias, [
-        f"the integrator's error at dt = {dt:g} moves {layout.names(readable)[worst]} by {shift[worst]:.2g}, "
+        f"the integrator's error at dt = {dt:g} moves {layout.names()[worst]} by {shift[worst]:.2g}, "
         f"{share[worst]:.2g} standard errors (.step_bias): use dt = {_advised(dt, share[worst], order):.2g}"
     ]
 
@@ -94,9 +95,8 @@ def bias_of_many(task: Recorded, found: Fit, asked: Asked) -> tuple[Any, list[st
     # measured so that the residual is the change, the step of the search is -J^+ of it: from fitted to exact
     as_if = asked.task._replace(data={**task.data, "targets": np.where(observed, whole - change, 0)})
     shift, decrease = products(problem.residual, asked.loss).step(asked.state.x, as_if, np.asarray(0.0))
-    freedom = max(int(np.sum(np.asarray(asked.task.weights) > 0)) - len(asked.state.x), 1)
-    variance = 1.0 if problem.absolute else float(np.sum(asked.state.residual**2)) / freedom
-    share = float(np.sqrt(max(float(decrease), 0.0) / len(asked.state.x) / max(variance, 1e-300)))
+    variance = variance_of_noise(problem, asked.task, asked.state)
+    share = float(np.sqrt(max(float(decrease), 0.0) / len(asked.state.x) / variance))
     bias = problem.layout.params(-np.asarray(shift, float))
     if not share > TENTH:
         return bias, []

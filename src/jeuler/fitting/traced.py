@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler.fitting import least_squares
+from jeuler.fitting.descent_traced import descended
 from jeuler.fitting.evaluate import evaluations
 from jeuler.fitting.least_squares import State, Task, advance, again, start
 from jeuler.fitting.losses import LOSSES
@@ -21,9 +22,9 @@ from jeuler.fitting.report import errors_of
 from jeuler.fitting.result import Fit
 
 
-def run_traced(problem: Problem, options: Options) -> Fit:
+def run_traced(problem: Problem, options: Options, scale: Any = None) -> Fit:
     """The fit of traced values. Words cannot be made of them: ``message`` says where to look."""
-    for name in ("optimizer", "minibatch", "starts", "resume"):
+    for name in ("minibatch", "starts", "resume"):
         if getattr(options, name) is not None:
             raise ValueError(f"{name} must be None where the fit is traced, under jit, vmap or grad")
     if options.loss != "linear" and options.loss_scale is None and not problem.absolute:
@@ -39,15 +40,19 @@ def run_traced(problem: Problem, options: Options) -> Fit:
     def residual(x: Array, data: Any) -> Array:
         return pure(x, data[0], *data[1])
 
-    state = _search(residual, problem, options, lax.stop_gradient(x), lax.stop_gradient(task))
+    unit = None if options.optimizer is None else jnp.asarray(problem.layout.spread("scale", scale, 1.0))
+    state = _search(residual, problem, options, unit, lax.stop_gradient(x), lax.stop_gradient(task))
     gradient = functools.partial(_gradient, residual, LOSSES[options.loss])
     best = _optimum(gradient, state.x, task)
     raw = residual(best, task.data)
     weighted = jnp.where(task.all_weights > 0, raw * task.all_weights, 0)
     size = jnp.maximum(jnp.sum(task.all_weights > 0), 1)
+    held = task.lower >= task.upper
+    state = state._replace(jacobian=jnp.where(held, 0, state.jacobian))
     found = errors_of(problem, state, task.spread, options.loss)
     error, white = (
-        jnp.where(found.blind, jnp.inf, jnp.sqrt(jnp.maximum(jnp.diag(c), 0))) for c in (found.covariance, found.white)
+        jnp.where(held, 0, jnp.where(found.blind, jnp.inf, jnp.sqrt(jnp.maximum(jnp.diag(c), 0))))
+        for c in (found.covariance, found.white)
     )
     layout = problem.layout
     return Fit(
@@ -67,10 +72,14 @@ def run_traced(problem: Problem, options: Options) -> Fit:
     )
 
 
-def _search(residual: Callable[..., Any], problem: Problem, options: Options, x: Array, task: Task) -> State:
-    """Through the stages in one scan, then over everything."""
+def _search(
+    residual: Callable[..., Any], problem: Problem, options: Options, unit: Array | None, x: Array, task: Task
+) -> State:
+    """Through the stages in one scan, then over everything; ``unit`` is that of an optax optimiser."""
     evaluate, never = evaluations(residual, compiled=False), jnp.iinfo(jnp.int32).max
     state = start(jnp.clip(x, task.lower, task.upper), len(task.weights), options.max_iterations)
+    if unit is not None:
+        return descended(evaluate, problem.stages, options, lax.stop_gradient(unit), state, task)
     if problem.stages:
         rough = task._replace(tolerance=jnp.asarray(ROUGH, x.dtype))
 

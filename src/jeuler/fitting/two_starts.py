@@ -23,7 +23,7 @@ def from_both(
         best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
     except ValueError:  # not finite there, as where a sensor's gain is not that of its start
         return run(given, options, scale=scale, known=known), "given"
-    if is_good(best.fit) or options.optimizer is not None:
+    if is_good(best.fit) or options.optimizer is not None or best.interrupted:
         return best, "data"
     try:
         other = run(given, dataclasses.replace(options, resume=None), scale=scale, known=known)

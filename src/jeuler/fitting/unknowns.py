@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -46,7 +45,7 @@ class Layout:
         pairs = list(zip(leaves, fitted, strict=True))
         shapes = tuple(jnp.shape(x) if yes else None for (_, x), yes in pairs)
         dtypes = tuple(jax.dtypes.canonicalize_dtype(jnp.result_type(x)) if yes else None for (_, x), yes in pairs)
-        kept = tuple(keystr(path) for path, x in leaves if isinstance(x, int) and _in_plain_containers(path))
+        kept = tuple(readable(path) for path, x in leaves if isinstance(x, int) and _in_plain_containers(path))
         return cls(rest, shapes, dtypes, kept)
 
     @property
@@ -118,23 +117,40 @@ class Layout:
             ) from None
         return values
 
-    def names(self, of_path: Callable[[tuple[Any, ...]], str] = keystr) -> tuple[str, ...]:
-        """One name for each number: "['ks']", "['ks'][3]"; with `readable` "ks", "ks[3]"."""
+    def names(self) -> tuple[str, ...]:
+        """One name for each number: "ks", "ks[3]"."""
         example = jax.tree.unflatten(self.structure, list(range(len(self.shapes))))
         names = []
         for (path, _), shape in zip(jax.tree_util.tree_leaves_with_path(example), self.shapes, strict=True):
             if shape is not None:
-                whole = of_path(path)
+                whole = readable(path)
                 names += [whole + (f"[{', '.join(map(str, k))}]" if shape else "") for k in np.ndindex(*shape)]
         return tuple(names)
 
+    def place(self, name: str, argument: str, otherwise: str = "") -> int:
+        """Which number has a name, or one ValueError of the argument that it came in."""
+        names = self.names()
+        if name not in names:
+            some = ", ".join(names[:8]) + ", ..." * (len(names) > 8)
+            raise ValueError(f"{argument} must be one of {some}{otherwise}, got {name!r}")
+        return names.index(name)
+
 
 def readable(path: tuple[Any, ...]) -> str:
-    """A leaf's place in words: keys of a dict without quotes and brackets at the outermost level."""
-    key = getattr(path[0], "key", None) if path else None
-    if isinstance(key, str):
-        return key + keystr(path[1:])
-    return "params" + keystr(path)
+    """A leaf's place in words: "ks", "ks[0]" of a list, "net.weight" of a dict or class, "params[0]" without a name."""
+    keys = [getattr(part, "key", None) for part in path]
+    named = bool(keys) and isinstance(keys[0], str)
+    words = str(keys[0]) if named else "params"
+    for part, key in list(zip(path, keys, strict=True))[named:]:
+        words += f".{key}" if isinstance(key, str) and key.isidentifier() else keystr((part,))
+    return words
+
+
+def size_of(x: Any) -> Any:
+    """What numbers are worth by themselves, as a step of an optimiser; 1 where they are 0."""
+    xp: Any = jnp if checks.is_traced(x) else np
+    x = xp.abs(xp.asarray(x, float))
+    return xp.where(x != 0, x, 1.0)
 
 
 def _in_plain_containers(path: tuple[Any, ...]) -> bool:
@@ -173,9 +189,11 @@ def checked_bounds(layout: Layout, x: Any, bounds: PyTree, positive: PyTree) -> 
             k = int(np.argmax(wrong))
             bound = "" if expected == "finite" else f" for bounds ({lower[k]:g}, {upper[k]:g})"
             raise ValueError(
-                f"the start of params{layout.names()[k]} must be {expected}, got {x[k]:g}{bound}; start it at a "
+                f"the start of {layout.names()[k]} must be {expected}, got {x[k]:g}{bound}; start it at a "
                 f"guess{'' if expected == 'finite' else ' between the bounds, or change them'}"
             )
+    if layout.size and (lower == upper).all():
+        raise ValueError(f"bounds must leave something to fit, got lower = upper for {', '.join(layout.names()[:6])}")
     return lower, upper
 
 

@@ -37,6 +37,7 @@ from jeuler.fitting.series import Columns, Series, one_after_another
 from jeuler.fitting.smoothness import alike_neighbours
 from jeuler.fitting.step_bias import RANDOM, UNKNOWN, shifted
 from jeuler.fitting.two_starts import from_both
+from jeuler.fitting.unknowns import size_of
 from jeuler.fitting.weak_form import weak_form
 from jeuler.particles.fields import draws
 from jeuler.particles.scene import Scene
@@ -161,7 +162,7 @@ class Several:
         alike = alike_neighbours(self.scene, self.residual.places, smoothness)
         given = self.problem(self.start, stages, priors, options.loss, alike)
         if self.traced:
-            return run(given, options), "given"
+            return run(given, options, scale=self._scale()), "given"
         begun = self._from_data(given) if start == "data" else None
         return from_both(given, begun, options, self._scale(), self._known(given))
 
@@ -220,11 +221,7 @@ class Several:
 
     def _scale(self) -> dict[str, Any]:
         """A sensible step of each parameter, for an optax optimiser."""
-
-        def size(x: Any) -> Any:
-            return np.where(np.asarray(x) != 0, np.abs(np.asarray(x, float)), 1.0)
-
-        return {name: jax.tree.map(size, x) for name, x in self.start.items()}
+        return {name: jax.tree.map(size_of, x) for name, x in self.start.items()}
 
     def states(self, params: dict[str, Any]) -> list[ParticleState]:
         """The initial states with the fitted parameters, one a recording."""
