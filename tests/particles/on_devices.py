@@ -28,7 +28,7 @@ floor = jeuler.Collisions((jeuler.Plane([0.0, -0.08], [0.0, 1.0]),), radius=jnp.
 
 def scene(ks, drag, effects=()):
     forces = (
-        jeuler.Springs(chain, ks, 0.05, 0.1),
+        jeuler.Springs(chain, ks, 0.05, 0.1, box=np.array([3.0, 9.0], ks.dtype)),
         jeuler.Bending(triples, 0.01),
         jeuler.Gravity([0.0, -9.8]),
         jeuler.LinearDrag(drag),

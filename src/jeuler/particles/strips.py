@@ -50,7 +50,7 @@ ALONE: dict[type, tuple[str, ...]] = {
 }
 # effects that do no more than to put particles where ``prescribe`` says: `jeuler.effects` names its own,
 ON_PATHS: set[type] = set()
-# and on groups of them, with the field that names these; all others are () or (group,).
+# and on groups of them, with the field that names these; all others but those of all groups are () or (group,).
 ON_GROUPS: dict[type, str] = {
     Bending: "triples",
     CubicSprings: "edges",
@@ -59,6 +59,7 @@ ON_GROUPS: dict[type, str] = {
     Torsion: "quads",
     Viscosity: "edges",
 }
+OF_ALL_GROUPS = ("box",)
 
 
 def acts_alone(part: Any) -> bool:
@@ -79,7 +80,8 @@ def numbers_of(part: Any) -> tuple[str, ...]:
     """The fields that may have one number a particle, or a group."""
     if acts_alone(part):
         return ALONE.get(type(part), ())
-    return tuple(field.name for field in dataclasses.fields(part) if field.name != ON_GROUPS[type(part)])
+    others = ON_GROUPS[type(part)], *OF_ALL_GROUPS
+    return tuple(field.name for field in dataclasses.fields(part) if field.name not in others)
 
 
 def _own(part: Any, which: Any) -> dict[str, Array]:
