@@ -92,9 +92,25 @@ def test_three_thousand_million_steps_are_counted(tmp_path):
     np.testing.assert_array_equal(np.asarray(run.y[0]), circle(40, save_every=10).y[0])
 
 
-def test_a_scene_whose_state_counts_its_steps_refuses_more_than_it_can_count(tmp_path):
-    with pytest.raises(ValueError, match="at most 2,147,483,647"):
-        fountain(3_000_000_000, resume=tmp_path / "run")
+@pytest.mark.parametrize("before", [2**31 - 2, 3_000_000_000])
+def test_a_scene_with_births_counts_three_thousand_million_steps(before):
+    pool = jeuler.empty_pool(64, 2).replace(steps=jnp.uint32(before), births=jnp.int32(2**31 - 2))
+    pool = pool.replace(missed_births=jnp.int32(0))
+    how = {"dt": 0.01, "key": jax.random.key(3)}
+    run = jeuler.simulate(POOL, pool, num_steps=4, **how)
+    assert run.y.steps.tolist() == [before + n for n in range(5)]
+    alive = run.y.alive.sum(axis=1).tolist()
+    born = [(n * int(0.6 * 2**32) + 2**22) >> 32 for n in range(before, before + 5)]  # 0.6 a step
+    expected = [count - born[0] for count in born]
+    assert alive == expected
+    assert run.y.births.tolist() == [min(2**31 - 2 + n, 2**31 - 1) for n in expected]
+    parts = jeuler.simulate(POOL, jax.tree.map(lambda x: x[2], run.y), num_steps=2, t0=run.t[2], **how)
+    np.testing.assert_array_equal(parts.y.position[1:], run.y.position[3:])
+
+
+def test_a_scene_refuses_more_steps_than_have_random_numbers_of_their_own(tmp_path):
+    with pytest.raises(ValueError, match="at most 4,294,967,295"):
+        fountain(5_000_000_000, resume=tmp_path / "run")
 
 
 def test_other_runs_and_broken_folders_are_told(tmp_path):

@@ -193,7 +193,8 @@ class Emitter:
         if state.age is not None:
             values["age"] = -since_step
         new = {name: put(name, getattr(state, name), value) for name, value in values.items()}
-        return state.replace(**new, births=state.births + births, missed_births=state.missed_births + wanted - births)
+        missed = add_up(state.missed_births, wanted - births)
+        return state.replace(**new, births=add_up(state.births, births), missed_births=missed)
 
     def _moving(self, t: Any, position: Array, velocity: Array, since_step: Array) -> tuple[Array, Array]:
         """Places and velocities of newborns on the path, each where it was at the moment of birth."""
@@ -238,6 +239,12 @@ def births_of_stream(n: Array, per_step: Array) -> Array:
     part = high.astype(jnp.uint32) * jnp.uint32(2**16) + ((share - high) * 2.0**16).astype(jnp.uint32)
     before = n.astype(jnp.uint32) * part + jnp.uint32(2**22)
     return whole.astype(jnp.int32) + (before + part < before).astype(jnp.int32)
+
+
+def add_up(count: Array, more: Array) -> Array:
+    """count + more, and the greatest number there is where that is above it."""
+    most = jnp.iinfo(count.dtype).max
+    return jnp.where(count > most - more, most, count + more)
 
 
 def births_by_turns(n: Array, per_step: Array) -> Array:

@@ -62,10 +62,10 @@ class ParticleState:
       opacity: (particle,), from 0 (invisible) to 1.
       size: (particle,), m, the diameter that is drawn.
       shape: (particle,), integer, the marker that is drawn: 0 circle, 1 square, 2 triangle, 3 diamond, 4 star.
-      births: () int32, the number of particles born since the start.
-      missed_births: () int32, the births that found no free slot.
+      births: () int32, the number of particles born since the start; it stays at 2^31 - 1.
+      missed_births: () int32, the births that found no free slot, likewise.
       unresolved_contacts: () int32, impacts and overlaps that `Collisions` did not resolve.
-      steps: () int32, the steps taken since the start, where random numbers or births hang on it: a run from a saved
+      steps: () uint32, the steps taken since the start, where random numbers or births hang on it: a run from a saved
         state goes on with those of the run that it was saved from.
       frames: (particle,) int32, the steps that a particle has lived, where `Lifetime` counts them.
       force: (particle, dim), N, what acted on each particle in the last step, where a user asks for it, see `simulate`.
@@ -260,7 +260,7 @@ def with_default_fields(
             values[name] = jnp.broadcast_to(state.mass, (particles,))
         elif name not in state.fields():
             if name in (*COUNTERS, "unresolved_contacts", "steps"):
-                values[name] = jnp.int32(0)
+                values[name] = jnp.uint32(0) if name == "steps" else jnp.int32(0)
             else:
                 form = DEFAULTS.get(name, (shapes or {}).get(name, ()))
                 shape, value, *whole = form if name in DEFAULTS or isinstance(form, FieldForm) else (form, 0.0)

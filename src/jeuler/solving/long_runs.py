@@ -15,13 +15,14 @@ from jeuler._core import checks
 from jeuler._core.component import replace
 from jeuler._jax import programs
 from jeuler.solving.chunks import EPOCH, FEWEST, Progress, Sizes, _begin, _chunk, _telling
-from jeuler.solving.grid import COUNTER, Grid
+from jeuler.solving.grid import Grid
 from jeuler.solving.loop import Loop
 from jeuler.solving.store import Store, names
 
 PyTree = Any
 BUFFER = 2**22  # bytes of frames that wait for the disk,
 MOST_ROWS = 4096  # as many at most
+MOST_DRAWS = 2**32 - 1  # steps with random numbers of their own: a key is folded with 32 bits
 SECONDS = 10.0  # between two states on disk, where the user does not say
 
 
@@ -112,10 +113,10 @@ class Run:
         """The fields of a `Solution`."""
         grid, total = self.grid, self.grid.num_steps
         paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(self.state)]
-        if total > COUNTER and any(path.endswith(".steps") for path in paths):
+        if total > MOST_DRAWS and any(path.endswith(".steps") for path in paths):
             raise ValueError(
-                f"num_steps must be at most {COUNTER:,} in a scene with births or random effects, whose state counts "
-                f"its steps in 32 bits, got {total:,}"
+                f"num_steps must be at most {MOST_DRAWS:,} in a scene with births or random effects, which would draw "
+                f"the same numbers again after these, got {total:,}"
             )
         if self.done > total:
             raise ValueError(
