@@ -94,6 +94,10 @@ STRAND_VELOCITY = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 0.2], [0.2, 0.5, -0.1],
 STRAND_REST = np.array([[[0.0, 0.0, 0.0], [0.3, 0.1, -0.2], [0.2, 0.4, -0.4], [0.5, 0.3, -0.8]]])
 FLOOR = jeuler.Plane([0.0, 0.4], [0.1, 1.0])
 
+BOULDER = jeuler.GridDistance(
+    [-2.0, -2.0], 0.7, np.hypot(*np.meshgrid(0.7 * np.arange(7) - 2.3, 0.7 * np.arange(7) - 2.2, indexing="ij")) - 0.9
+)  # about (0.3, 0.2)
+
 NEAR = jeuler.Neighbours(cutoff=1.4, skin=0.2, capacity=3)
 
 
@@ -137,7 +141,7 @@ FORCES = {
     "viscosity": lambda: jeuler.Viscosity(NET_EDGES, np.linspace(0.1, 0.5, 5)),
     "bending": lambda: jeuler.Bending([[0, 1, 2], [1, 2, 3]], [0.3, 0.5], 0.4),
     "shape_matching": lambda: jeuler.ShapeMatching(range(4), 1.2 * NET_POSITION[::-1], 5.0, damping=0.4),
-    "penalty_contact": lambda: jeuler.PenaltyContact(FLOOR, ks=40.0, kd=0.2, radius=0.1),
+    "penalty_contact": lambda: jeuler.PenaltyContact(BOULDER, ks=40.0, kd=0.2, radius=0.1),
     "strand_bending": lambda: jeuler.StrandBending(STRAND, STRAND_REST, 3.0, 0.5, 1.0),
     "strand_core": lambda: jeuler.StrandCore(STRAND, STRAND_REST, 3.0, 0.5, 1.0),
     "function": lambda: lambda t, position, velocity, mass: -0.1 * velocity + 0.2 * jnp.sin(t),

@@ -81,6 +81,8 @@ RESULTS = {
     "Solution": solution,
     "Ensemble": lambda: jeuler.ensemble(jnp.sin, jnp.ones(2)),
     "Moments": lambda: jeuler.Moments(),
+    "MeshBody": lambda: jeuler.rope([0.0, 0.0], [1.0, 0.0], 3, density=1.0, ks=2.0, bending=0.1),
+    "GridDistance": lambda: jeuler.GridDistance([0.0], 1.0, [1.0, -1.0, 1.0]),
     "Division": lambda: jeuler.divide(jeuler.Scene((hanging()[0].forces[0],)), hanging()[1], devices=1),
     "Quantiles": lambda: jeuler.Quantiles((0.5,), bounds=(0.0, 1.0)),
     "AdaptiveSolution": lambda: jeuler.solve_adaptive(decay, 1.0, t1=1.0, rtol=1e-3, max_steps=16),

@@ -77,6 +77,7 @@ def test_the_package_shows_its_public_names_and_its_namespaces():
         "effects",
         "fitting",
         "forces",
+        "meshes",
         "observing",
         "plotting",
         "samplers",

@@ -2,7 +2,8 @@
 
 The verbs stand here: `solve`, `simulate`, `fit`, `fit_springs`, `advise_step`, `advise_method`, `work_precision`,
 `stability_limit`, `diagnose`. The catalogues have a namespace each: `jeuler.forces`, `jeuler.effects`,
-`jeuler.contact`, `jeuler.samplers`, `jeuler.steps`; figures are in `jeuler.plotting`, scenes in `jeuler.scenes`.
+`jeuler.contact`, `jeuler.samplers`, `jeuler.steps`; bodies from meshes are in `jeuler.meshes`, figures
+in `jeuler.plotting`, scenes in `jeuler.scenes`.
 """
 
 import importlib
@@ -13,7 +14,7 @@ from jeuler import effects as effects
 from jeuler import forces as forces
 from jeuler import samplers as samplers
 from jeuler import steps as steps
-from jeuler.contact import Box, Collisions, PenaltyContact, Plane, Sphere
+from jeuler.contact import Box, Collisions, GridDistance, PenaltyContact, Plane, Sphere
 from jeuler.effects import (
     Breaking,
     Death,
@@ -104,6 +105,7 @@ if TYPE_CHECKING:
         multiple_shooting,
         read_trajectory,
     )
+    from jeuler.meshes import MeshBody, from_mesh, grid_cloth, mesh_collider, rope
 
 __version__ = "0.2.0"
 
@@ -138,10 +140,12 @@ __all__ = [
     "FromSphere",
     "FromSurface",
     "Gravity",
+    "GridDistance",
     "Gust",
     "Identifiability",
     "Lifetime",
     "LinearDrag",
+    "MeshBody",
     "Method",
     "MethodAdvice",
     "Moments",
@@ -194,6 +198,8 @@ __all__ = [
     "find_springs",
     "fit",
     "fit_springs",
+    "from_mesh",
+    "grid_cloth",
     "heun_step",
     "identifiability",
     "implicit_euler",
@@ -201,9 +207,11 @@ __all__ = [
     "implicit_midpoint_step",
     "linearly_implicit_euler",
     "linearly_implicit_euler_step",
+    "mesh_collider",
     "multiple_shooting",
     "read_trajectory",
     "rk4_step",
+    "rope",
     "simulate",
     "solve",
     "solve_adaptive",
@@ -228,6 +236,7 @@ _ON_DEMAND = {  # packages that are imported at the first use of a name of their
         "work_precision",
     ),
     "diagnosis": ("Diagnosis", "diagnose"),
+    "meshes": ("MeshBody", "from_mesh", "grid_cloth", "mesh_collider", "rope"),
     "observing": (),
     "plotting": (),
     "scenes": (),

@@ -2,11 +2,13 @@
 
 from jeuler.contact.colliders import Box, Plane, Sphere
 from jeuler.contact.collisions import Collisions
+from jeuler.contact.grid import GridDistance
 from jeuler.contact.penalty import PenaltyContact
 
 __all__ = [
     "Box",
     "Collisions",
+    "GridDistance",
     "PenaltyContact",
     "Plane",
     "Sphere",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jeuler._core.component import result
+from jeuler.meshes.bodies import grid, table
 
 
 @result
@@ -29,22 +30,9 @@ class Body:
         return np.linalg.norm(self.position[self.edges[:, 0]] - self.position[self.edges[:, 1]], axis=1)
 
 
-def rows(*columns: np.ndarray) -> np.ndarray:
-    """Index arrays of like shape as the columns of a table, (row, column)."""
-    return np.stack(columns, axis=-1).reshape(-1, len(columns))
-
-
 def square_cloth(side: int, width: float) -> Body:
     """A level square of side x side particles about the origin, joined along its threads and across its meshes."""
-    g = np.arange(side * side).reshape(side, side)
-    x, y = np.meshgrid(*[np.linspace(-width / 2, width / 2, side)] * 2, indexing="ij")
-    a, b, c, d = g[:-1, :-1], g[1:, :-1], g[1:, 1:], g[:-1, 1:]
-    return Body(
-        position=np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3),
-        edges=np.concatenate([rows(g[:-1], g[1:]), rows(g[:, :-1], g[:, 1:]), rows(a, c), rows(d, b)]),
-        faces=np.concatenate([rows(a, b, c), rows(a, c, d)]),
-        lines=np.concatenate([rows(g[:-2], g[1:-1], g[2:]), rows(g[:, :-2], g[:, 1:-1], g[:, 2:])]),
-    )
+    return Body(*grid((side, side), (width, width)))
 
 
 def cube(side: int, width: float) -> Body:
@@ -55,10 +43,10 @@ def cube(side: int, width: float) -> Body:
     for axis in range(3):
         for skin in (g.take([0], axis).squeeze(axis), g.take([-1], axis).squeeze(axis)):
             a, b, c, d = skin[:-1, :-1], skin[1:, :-1], skin[1:, 1:], skin[:-1, 1:]
-            faces += [rows(a, b, c), rows(a, c, d)]
+            faces += [table(a, b, c), table(a, c, d)]
     return Body(
         position=np.stack(np.meshgrid(along, along, along, indexing="ij"), axis=-1).reshape(-1, 3),
-        edges=np.concatenate([rows(g[:-1], g[1:]), rows(g[:, :-1], g[:, 1:]), rows(g[:, :, :-1], g[:, :, 1:])]),
+        edges=np.concatenate([table(g[:-1], g[1:]), table(g[:, :-1], g[:, 1:]), table(g[:, :, :-1], g[:, :, 1:])]),
         faces=np.concatenate(faces),
         lines=np.zeros((0, 3), int),
     )
