@@ -119,6 +119,7 @@ def of_those_near():
 
 FORCES = {
     "nearby": of_those_near,
+    "triangle_contact": lambda: AllPairs((jeuler.TriangleContact(NEAR, [[1, 2, 3]], 0.6, ks=20.0, kd=0.5),)),
     "cubic_springs": lambda: jeuler.CubicSprings(NET_EDGES, np.linspace(20.0, 60.0, 5), 0.7, 0.9, cubic=30.0),
     "strings": lambda: jeuler.Strings(NET_EDGES, ks=30.0, kd=0.7, rest_length=np.linspace(0.9, 1.3, 5)),
     "torsion": lambda: jeuler.Torsion(STRAND, 0.4, 2.0),
@@ -146,7 +147,7 @@ FORCES = {
     "strand_core": lambda: jeuler.StrandCore(STRAND, STRAND_REST, 3.0, 0.5, 1.0),
     "function": lambda: lambda t, position, velocity, mass: -0.1 * velocity + 0.2 * jnp.sin(t),
 }
-IN_SPACE = ("strand_bending", "strand_core", "torsion")
+IN_SPACE = ("triangle_contact", "strand_bending", "strand_core", "torsion")
 # action equals reaction; and those whose forces have no torque either
 INTERNAL_FORCES = (
     "springs", "springs_in_a_box", "springs_without_length", "no_springs", "cubic_springs", "strings", "viscosity", "bending", "shape_matching", *IN_SPACE,

@@ -7,6 +7,8 @@ import pytest
 
 import jeuler
 from jeuler import Flocking, Fluid, Neighbours, ParticleState, Scene, SoftRepulsion
+from jeuler._core.triangles import nearest_weights
+from jeuler._core.vectors import length
 
 
 def rows_of(near, x, **fields):
@@ -149,3 +151,66 @@ def test_a_newborn_in_a_slot_of_zeros_feels_nobody_before_it_has_a_row():
     run = jeuler.simulate(scene, pool, dt=0.1, num_steps=2, key=jax.random.key(0)).y
     assert not run.velocity[1].any()
     np.testing.assert_allclose(run.velocity[2, :, 0], [-0.4, 0.4])
+
+
+def test_the_nearest_point_of_a_triangle_is_the_nearest_of_many():
+    """Beside each side and corner, above the inside, on it; and of a triangle without area."""
+    corners = np.array(
+        [[[0.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.2, 0.9, 0.3]], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.0, 0.0]]]
+    )
+    p = np.concatenate([np.random.default_rng(0).uniform(-1, 2, (60, 3)), corners[0], corners.mean(axis=1)])
+    a, b = np.meshgrid(np.linspace(0, 1, 101), np.linspace(0, 1, 101))
+    a, b = a[a + b <= 1 + 1e-9], b[a + b <= 1 + 1e-9]
+    for triangle in corners:
+        w = np.asarray(nearest_weights(jnp.asarray(p), jnp.broadcast_to(triangle, (len(p), 3, 3))))
+        np.testing.assert_allclose(w.sum(axis=1), 1, atol=1e-12)
+        assert w.min() >= 0
+        found = np.linalg.norm(p - w @ triangle, axis=1)
+        sampled = np.linalg.norm(p[:, None] - np.stack([1 - a - b, a, b], axis=1) @ triangle, axis=2).min(axis=1)
+        assert (found <= sampled + 1e-12).all()
+        np.testing.assert_allclose(found, sampled, atol=0.012)
+
+
+def test_a_particle_is_pushed_off_a_sheet_with_no_momentum_or_torque_made():
+    """Above each kind of place of a triangle and far from its owner; the force is the slope of its energy."""
+    sheet = jeuler.grid_cloth((3, 3), (2.0, 2.0), density=1.0, ks=1.0)
+    x = np.concatenate([sheet.state.position, [[-0.6, -0.7, 0.06], [0.3, 0.3, -0.05], [1.05, 0.4, 0.02]]])
+    triangles = sheet.triangles
+    v = np.random.default_rng(0).normal(size=x.shape)
+
+    def near(cutoff):
+        return Neighbours(cutoff, 0.1, capacity=11, cell_capacity=12)
+
+    def force(x, kd=0.0, cutoff=1.8):
+        effect = near(cutoff)
+        contact = jeuler.TriangleContact(effect, triangles, thickness=0.1, ks=50.0, kd=kd)
+        state = ParticleState(x, v)
+        made = effect(0.0, jnp.asarray(0.1), state, state.replace(**with_rows(len(x), 11)), None)
+        return contact(0.0, x, jnp.asarray(v), 1.0, made.neighbours)
+
+    def energy(x):
+        corners = jnp.broadcast_to(x[triangles], (len(x), *triangles.shape, 3))
+        w = nearest_weights(x[:, None], corners)
+        r = length(x[:, None] - jnp.sum(w[..., None] * corners, axis=2))
+        own = (triangles[None] == np.arange(len(x))[:, None, None]).any(axis=2)
+        return jnp.sum(jnp.where(own, 0, jnp.maximum(0.1 - r, 0) ** 2)) * 25.0
+
+    x = jnp.asarray(x)
+    found = jax.jit(force)(x)
+    np.testing.assert_allclose(found, -jax.jit(jax.grad(energy))(x), atol=1e-12)
+    assert (jnp.abs(found[9:]).max(axis=1) > 1).all(), "all three are pushed"
+    damped = jax.jit(lambda x: force(x, kd=2.0))(x)
+    for f in (found, damped):
+        np.testing.assert_allclose(jnp.sum(f, axis=0), 0, atol=1e-12)
+        np.testing.assert_allclose(jnp.sum(jnp.cross(x, f), axis=0), 0, atol=1e-12)
+    assert jnp.isnan(jax.jit(lambda x: force(x, cutoff=1.4))(x)).all(), "a side is longer than the cutoff less s"
+
+
+def with_rows(particles, capacity):
+    """The fields of a state whose rows were never made."""
+    return {
+        "neighbours": jnp.full((particles, capacity), -2, jnp.int32),
+        "neighbours_made_at": jnp.zeros((particles, 3)),
+        "has_neighbours": jnp.zeros(particles, bool),
+        "missed_neighbours": jnp.zeros(1, jnp.int32),
+    }

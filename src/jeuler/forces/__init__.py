@@ -10,6 +10,7 @@ from jeuler.forces.hair import StrandBending, StrandCore, strand_edges
 from jeuler.forces.links import BreakableSprings, CubicSprings, Strings
 from jeuler.forces.nearby import Flocking, Fluid, SoftRepulsion
 from jeuler.forces.neighbours import Bending, Viscosity
+from jeuler.forces.sheets import TriangleContact
 from jeuler.forces.soft_body import ShapeMatching
 from jeuler.forces.springs import Springs
 from jeuler.forces.torsion import Torsion
@@ -34,6 +35,7 @@ __all__ = [
     "StrandCore",
     "Strings",
     "Torsion",
+    "TriangleContact",
     "Turbulence",
     "Viscosity",
     "Vortex",

@@ -77,13 +77,17 @@ class _Nearby:
         has_neighbours: Array | None = None,
     ) -> Array:
         """The sum of what the neighbours exert; NaN where rows were never made."""
-        if neighbours_made_at is not None and has_neighbours is not None:
-            at = neighbours_made_at, has_neighbours, self.alive
-            neighbours = self.neighbours.rows_at(position, neighbours, *at)
+        neighbours = self._rows_at(position, neighbours, neighbours_made_at, has_neighbours)
         pairs = self._pairs(position, neighbours, has_neighbours)
         shares = self._shares(pairs, position, split(velocity), mass)
         total = stack([pairs.sum(share) for share in shares])
         return jnp.where(neighbours[:, :1] == NOT_BUILT, jnp.nan, total)
+
+    def _rows_at(self, position: Array, rows: Array, made_at: Array | None, has: Array | None) -> Array:
+        """The rows for these positions, those of the state or new ones."""
+        if made_at is None or has is None:
+            return rows
+        return self.neighbours.rows_at(position, rows, made_at, has, self.alive)
 
     def _pairs(self, position: Array, rows: Array, made: Array | None) -> Pairs:
         dtype, x = position.dtype, split(position)
