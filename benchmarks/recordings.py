@@ -3,6 +3,7 @@
     python benchmarks/recordings.py                      everything; about half an hour on two cores
     python benchmarks/recordings.py quirks FOLDER        every file of a folder (default tests/data/recordings)
     python benchmarks/recordings.py measured FOLDER      the measured files of ../shared/data
+    python benchmarks/recordings.py pendulum FOLDER      its single pendulum to 55 s by frictions that no option names
     python benchmarks/recordings.py long                 18,000 and 1,000,000 rows, 723 rows, reading 100,000 rows
     python benchmarks/recordings.py damaged [COUNT]      damaged files, each by a process of its own
     python benchmarks/recordings.py users                six kinds of file as a new user goes: look, then its command
@@ -106,6 +107,47 @@ def measured(folder: str = str(ROOT.parent / "shared" / "data")) -> None:
             )
             words += "".join(f"; {row['friction']} {row['score']:.3g}" for row in told.get("comparison", []))
         print(f"{name} {' '.join(arguments):<66} {words}", flush=True)
+
+
+def pendulum(folder: str = str(ROOT.parent / "shared" / "data")) -> None:
+    """The friction of the bearing: a damper, air and a dry bearing at once, and a dry one that falls with the speed."""
+    import jax
+    import jax.numpy as jnp
+
+    import jeuler
+
+    jax.config.update("jax_enable_x64", True)
+    times, columns = jeuler.read_trajectory(os.path.join(folder, "pendulum_single.csv"), si=True)
+    angle = next(iter(columns.values()))[times <= 55]
+
+    def three(v, p):
+        return p["kd"] * v + p["quadratic"] * v * jnp.abs(v) + p["dry"] * jnp.tanh(v / 0.05)
+
+    def falling(v, p):
+        more = 1 + p["more"] * jnp.exp(-jnp.abs(v) / p["speed"])
+        return p["quadratic"] * v * jnp.abs(v) + p["dry"] * more * jnp.tanh(v / 0.05)
+
+    def residual(friction, p, data):
+        def motion(t, y, args):
+            return jnp.stack([y[1], -p["w2"] * jnp.sin(y[0] - p["zero"]) - friction(y[1], p)])
+
+        run = jeuler.solve(motion, p["start"], dt=0.01, num_steps=len(angle) - 1, step=jeuler.rk4_step)
+        return run.y[:, 0] - data
+
+    begin = {"w2": 64.1, "zero": 0.0, "start": jnp.array([angle[0], 1.9]), "quadratic": 0.006}
+    for friction, own in (
+        (three, {"kd": 0.0, "dry": 0.15}),
+        (falling, {"dry": 0.12, "more": 1.5, "speed": 2.0}),
+    ):
+        began = time.process_time()
+        found = jeuler.fit(lambda p, data, f=friction: residual(f, p, data), {**begin, **own}, data=angle)
+        numbers = ", ".join(f"{name} {float(found.params[name]):.4g}" for name in ("w2", "quadratic", *own))
+        share = 100 * np.sqrt(found.loss) / np.abs(angle).max()
+        print(
+            f"{friction.__name__}: {numbers}; {share:.3g} % of the amplitude, lag one {found.autocorrelation:.3f}, "
+            f"{time.process_time() - began:.1f} s of CPU; {found.message}",
+            flush=True,
+        )
 
 
 def long() -> None:
@@ -221,7 +263,15 @@ def users() -> None:
             print(f"{name:<14} fit {command:<40} {words}  off {off[0]:+.2f} %, {off[1]:+.2f} %", *told["warnings"])
 
 
-PARTS = {"quirks": quirks, "measured": measured, "long": long, "damaged": damaged, "users": users, "killed": killed}
+PARTS = {
+    "quirks": quirks,
+    "measured": measured,
+    "pendulum": pendulum,
+    "long": long,
+    "damaged": damaged,
+    "users": users,
+    "killed": killed,
+}
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
