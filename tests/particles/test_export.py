@@ -68,6 +68,7 @@ def test_nc_is_the_dataset_as_xarray_reads_it(tmp_path):
 
 @pytest.mark.parametrize("end", ["usd", "usda"])
 def test_usd_opens_with_its_own_library(tmp_path, end):
+    pytest.importorskip("pxr", reason="needs the library usd-core")
     from pxr import Usd, UsdGeom
 
     red = jnp.tile(jnp.array([1.0, 0.2, 0.0]), (2, 3, 1))
