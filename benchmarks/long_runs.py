@@ -2,6 +2,7 @@
 
 python benchmarks/long_runs.py kills 20      kill -9 at so many random moments; the result beside a run in one go
 python benchmarks/long_runs.py full          a disk that takes no more (ulimit -f)
+python benchmarks/long_runs.py progress 3    some seconds with a bar and without, in turn so many times: CPU time
 python benchmarks/long_runs.py memory 1000   as many steps a frame, 1e4 frames of 1,000 particles: resident memory
 """
 
@@ -67,6 +68,24 @@ def full():
         print(f"last good state readable: {found.y.position}")
 
 
+def progress(times=3):
+    """CPU seconds, which other programs disturb less."""
+
+    def run(bar):
+        how = {"dt": 1e-6, "num_steps": 1_000_000_000, "save_every": 100_000_000, "progress": bar}
+        return jeuler.solve(lambda t, y, a: (y[1], -y[0]), (1.0, 0.0), **how)
+
+    seconds = {None: [], True: []}
+    for n in range(times + 1):
+        for bar in seconds:
+            start = time.process_time()
+            jax.block_until_ready(run(bar).t)
+            if n:  # the first one compiles
+                seconds[bar].append(time.process_time() - start)
+    without, with_bar = (np.median(seconds[bar]) for bar in (None, True))
+    print(f"{without:.2f} s of CPU, with a bar {with_bar:.2f} s, {with_bar / without - 1:+.1%}", seconds)
+
+
 def memory(save_every=1000):
     rng = np.random.default_rng(0)
     state = jeuler.ParticleState(rng.normal(size=(1000, 3)), np.zeros((1000, 3)))
@@ -97,4 +116,4 @@ if __name__ == "__main__":
     if task == "child":
         fountain(STEPS, resume=rest[0], checkpoint_every=5_000)
     else:
-        {"kills": kills, "full": full, "memory": memory}[task](*map(int, rest))
+        {"kills": kills, "full": full, "progress": progress, "memory": memory}[task](*map(int, rest))
