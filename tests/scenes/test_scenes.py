@@ -11,6 +11,7 @@ import pytest
 import jeuler
 from jeuler import scenes
 from jeuler._jax.haste import jit_in_haste
+from jeuler.plotting.render import colliders_of
 
 # fewer steps than the film has: long enough to see the point
 SHORT = {
@@ -142,6 +143,7 @@ def test_the_flock_keeps_its_distance_goes_one_way_and_stays_together():
 
 def test_the_dam_breaks_runs_along_the_trough_and_stays_in_it_with_all_its_water():
     setup, y = run("dam_break", across=3)
+    assert [type(solid).__name__ for solid in colliders_of(setup.scene)] == ["Plane"], "no wall hides the water"
     x, size = np.asarray(y.position), 0.05
     assert int(y.missed_neighbours[-1]) == 0
     assert x[..., 2].min() > 0.4 * size

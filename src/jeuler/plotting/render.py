@@ -37,7 +37,7 @@ class Look:
         velocity (four looks that only `still` has, elsewhere they are dots); False draws no particles, only what
         they hold.
       sky: colour of the upper end of the background in `still`; None takes the background's.
-      solids: colour of solids in `still`.
+      solids: colour of solids in `still`. A collider that has ``drawn = False`` is not in any picture.
       hair: a `Hair`, strands about guides, in `still`.
       dust: colour of the dust that runners raise in `still`; None raises none.
       haze: how fast what is far fades into the background in `still`, 0 for clear air.
@@ -138,7 +138,8 @@ def colors_of(state: ParticleState) -> np.ndarray:
 def colliders_of(scene: Any) -> list[Any]:
     """The solids of a scene's effects and forces."""
     colliders = [collider for effect in getattr(scene, "effects", ()) for collider in declared(effect, "colliders")]
-    return colliders + [force.collider for force in getattr(scene, "forces", ()) if hasattr(force, "collider")]
+    colliders += [force.collider for force in getattr(scene, "forces", ()) if hasattr(force, "collider")]
+    return [collider for collider in colliders if declared(collider, "drawn", True)]
 
 
 def springs_of(scene: Any) -> list[Any]:

@@ -59,6 +59,7 @@ def dam_break(across: int = 8, spacing: float = 0.05) -> Setup:
         x, y, _ = point
         return jnp.minimum(jnp.minimum(x, long - x), jnp.minimum(y, wide - y))
 
+    walls.drawn = False  # type: ignore[attr-defined]  # of glass: the one in front would hide all
     floor = Plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     trough = Collisions((floor, walls), radius=spacing / 2, restitution=0.1)
     state = ParticleState(position, 0 * position, mass=1000 * spacing**3, size=np.full(len(place), 1.25 * spacing))
