@@ -249,10 +249,12 @@ def kills(count=20):
             path, killed, taken_up = os.path.join(folder, "state"), 0, 0
             whole = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()[1]
             for _ in range(count // len(kinds)):
-                taken_up += os.path.exists(path)
+                before = os.path.getmtime(path) if os.path.exists(path) else 0.0
+                taken_up += before > 0
                 with subprocess.Popen([*command, path], stdout=subprocess.PIPE, text=True) as running:
-                    running.stdout.readline()  # it has begun
-                    time.sleep(random.uniform(0.2, 4.0))
+                    while running.poll() is None and not (os.path.exists(path) and os.path.getmtime(path) > before):
+                        time.sleep(0.01)
+                    time.sleep(random.uniform(0.0, 1.5))  # some moment after its first write
                     killed += running.poll() is None
                     running.kill()
             last = subprocess.run([*command, path], capture_output=True, text=True, check=True).stdout.splitlines()[1]

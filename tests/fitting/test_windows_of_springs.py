@@ -72,8 +72,8 @@ def heights(t, e, h=1.0, g=9.81):
     return y
 
 
-@pytest.mark.parametrize("name", ["restitution", "effects[0].restitution"])
-def test_restitution_of_a_bouncing_ball(name):
+def test_restitution_of_a_bouncing_ball():
+    name = "effects[0].restitution"
     t = np.linspace(0, 1.4, 57)
     positions = np.stack([0 * t, heights(t, 0.7)], 1)[:, None]
     ball = jeuler.ParticleState([[0.0, 1.0]], [[0.0, 0.0]])
@@ -110,10 +110,10 @@ def test_a_scene_that_draws_random_numbers_is_fitted_with_its_key(observe, tmp_p
     scene = jeuler.Scene(SCENE.forces, (shaken,))
     right = jeuler.Scene((jeuler.Springs([[0, 1]], 9.0, 0.2, 1.0),), (shaken,))
     key = jax.random.key(5)
-    run = jeuler.simulate(right, STATE, dt=0.08, num_steps=40, step=jeuler.rk4_step, key=key)
+    run = jeuler.simulate(right, STATE, dt=0.08, num_steps=40, step=jeuler.symplectic_euler_step, key=key)
     measured = np.array(getattr(run.y, observe))
     kept = tmp_path / "fit" if observe == "position" else None
-    options = {"dt": 0.08, "observe": observe, "resume": kept}
+    options = {"dt": 0.08, "observe": observe, "resume": kept, "step": jeuler.symplectic_euler_step}
     found = jeuler.fit_springs(scene, STATE, run.t, measured, **options, key=key, checkpoint="sqrt")
     np.testing.assert_allclose([found.ks, found.kd], [9.0, 0.2], rtol=1e-5)
     assert found.message.endswith("the run draws random numbers in each step, so the bias of the step is not known")
