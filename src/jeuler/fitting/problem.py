@@ -232,7 +232,8 @@ def variance_of_noise(problem: Problem, task: Task, state: Any) -> float:
     """That of a weighted residual: 1 where sigma is given, or what the best fit leaves over, per degree of freedom."""
     if problem.absolute:
         return 1.0
-    freedom = max(int(np.sum(np.asarray(task.all_weights) > 0)) - len(state.x), 1)
+    unknowns = int(np.sum(np.asarray(problem.lower < problem.upper)))
+    freedom = max(int(np.sum(np.asarray(task.all_weights) > 0)) - unknowns, 1)
     return max(float(np.sum(np.asarray(state.residual) ** 2)) / freedom, 1e-300)
 
 
