@@ -121,7 +121,7 @@ def test_breaks_hold_backwards_in_time_beside_far_ones_and_in_a_batch_of_both_di
 
     def end(dt, t0, b):
         field = lambda t, y, b: jnp.where(t < b, 1.0, -1.0) * jnp.ones_like(y)  # noqa: E731
-        breaks = jnp.stack([b, b, 1e300, -7.0, 0.2])
+        breaks = jnp.stack([b, 1e300, 1e300, -7.0, 0.2])
         return jeuler.solve(field, 0.0, dt=dt, num_steps=10, t0=t0, step=step, args=b, breaks=breaks).y[-1]
 
     dts, t0s = jnp.array([0.1, -0.1] * 5), jnp.array([0.0, 1.0] * 5)
@@ -129,6 +129,24 @@ def test_breaks_hold_backwards_in_time_beside_far_ones_and_in_a_batch_of_both_di
     ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end, argnums=2)))(dts, t0s, breaks)
     np.testing.assert_allclose(ends, jnp.sign(dts) * (2 * breaks - 1), atol=1e-14)
     np.testing.assert_allclose(slopes[:4], 2 * jnp.sign(dts)[:4], atol=1e-14)
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_the_derivative_by_one_of_two_breaks_at_one_time_is_nan(adaptive, derivative):
+    """f jumps at b from 1 to -1, and not at c: y(1) = 2 b - 1, from either side of c; at c it cannot be told."""
+
+    def end(b, c):
+        field = lambda t, y, b: jnp.where(t < b, 1.0, -1.0) * jnp.ones_like(y)  # noqa: E731
+        breaks = jnp.stack([b, c, 7.0, 7.0])
+        if adaptive:
+            return jeuler.solve_adaptive(field, 0.0, t1=1.0, args=b, breaks=breaks).y[-1]
+        return jeuler.solve(field, 0.0, dt=0.1, num_steps=10, args=b, breaks=breaks).y[-1]
+
+    slopes = jax.jit(jax.vmap(derivative(end, argnums=(0, 1)), in_axes=(None, 0)))(0.5, jnp.array([0.2, 0.5, 0.53, 1.2]))
+    np.testing.assert_allclose(slopes[0], [2.0, np.nan, 2.0, 2.0], atol=1e-12)
+    np.testing.assert_allclose(slopes[1], [0.0, np.nan, 0.0, 0.0], atol=1e-12)
+    assert float(end(0.5, 0.5)) == pytest.approx(0.0, abs=1e-14)
 
 
 def test_adaptive_steps_heed_a_break_beside_a_far_one_and_none_that_is_nan():

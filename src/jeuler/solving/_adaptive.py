@@ -15,7 +15,7 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import Function, component
 from jeuler._core.partition import arrays_only
 from jeuler._jax import programs
-from jeuler.solving._breaks import between, checked_breaks
+from jeuler.solving._breaks import between, checked_breaks, told_apart
 from jeuler.solving._tables import adaptive_table
 from jeuler.steps.embedded import tsit5
 from jeuler.steps.explicit import VectorField
@@ -104,7 +104,8 @@ def solve_adaptive(
       max_dt: longest step to take, s; None sets no bound.
       max_steps: most steps, rejected ones included, from one of the times or breaks to the next.
       breaks: times at which f may jump, (break,), s: a step ends there, f is evaluated just before the end of it and
-        just after the start of the next. Differentiable.
+        just after the start of the next. Differentiable, by each time that no other break has too: there the derivative
+        is NaN.
     Returns: `AdaptiveSolution`.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
     Example:
@@ -164,6 +165,7 @@ def _solve_adaptive(
     f, step = field.function, stepper.function
     checks.vector_field(f, t0, y0, args)
     times = jnp.where(_in_order(t0, times) & ~jnp.any(jnp.isnan(breaks)), times, jnp.nan)
+    breaks = told_apart(breaks, t0, times[-1])
     if dt0 is None:
         dt0 = first_step(y0, f(t0, y0, args), times[-1] - t0)
     if max_dt is not None:

@@ -35,6 +35,31 @@ def margin(breaks: Array, first: Array, last: Array) -> Array:
     return lax.stop_gradient(SIDE * jnp.finfo(breaks.dtype).eps * largest)
 
 
+@jax.custom_jvp
+def _with_slope(x: Array, slope: Array) -> Array:
+    """x, whose derivative is multiplied by the slope."""
+    return x
+
+
+@_with_slope.defjvp
+def _with_slope_jvp(primals, tangents):
+    return primals[0], tangents[0] * primals[1]
+
+
+def told_apart(breaks: Array, start: Array, end: Array) -> Array:
+    """The breaks, the derivative by each that has another at its time, to rounding, within the run being NaN.
+
+    What f does between the two is never seen, so nothing tells which of them moves the jump.
+    """
+    if breaks.size < 2:
+        return breaks
+    first, last = jnp.minimum(start, end), jnp.maximum(start, end)
+    gap = margin(breaks, first, last)
+    near = jnp.abs(breaks[:, None] - breaks) <= gap
+    within = (breaks >= first - gap) & (breaks <= last + gap)
+    return _with_slope(breaks, jnp.where((jnp.sum(near, axis=1) > 1) & within, jnp.nan, jnp.ones_like(breaks)))
+
+
 def between(f: VectorField, breaks: Array, start: Array, end: Array) -> VectorField:
     """f on the step from start to end, forwards or backwards: evaluated just inside of an end that is a break."""
     first, last = jnp.minimum(start, end), jnp.maximum(start, end)

@@ -15,7 +15,7 @@ from jeuler._core.component import Function, component
 from jeuler._core.partition import arrays_only
 from jeuler._jax import programs
 from jeuler._jax.members import recomputed
-from jeuler.solving._breaks import checked_breaks, split_at
+from jeuler.solving._breaks import checked_breaks, split_at, told_apart
 from jeuler.solving._reversible import check as check_reversible
 from jeuler.solving._reversible import reversible
 from jeuler.solving._tables import solution_table
@@ -143,7 +143,7 @@ def solve(
         in the last place instead of growing with the number of steps. Explicit steps only.
       breaks: times at which f may jump, (break,), s: the step that a break falls into ends there and goes on from it,
         and f is evaluated just before and just after. A jump at the last time must be named too, or the last step
-        sees f after it. Differentiable.
+        sees f after it. Differentiable, by each time that no other break has too: there the derivative is NaN.
       progress: True shows a bar with an estimate of the end; a function is called as ``progress(step, num_steps)``
         about ten times a second, and what it raises ends the run. Not under jit, vmap or grad, nor with "reversible".
       resume: path of a folder in which the run keeps its saved frames and its last state, and from which the same call
@@ -207,7 +207,7 @@ def _loop(
         return reversible_loop(f, y0, args, grid, save, step, compensated)
     advance = advance_by(step, compensated=compensated)
     if breaks.size:
-        advance = split_at(advance, breaks)
+        advance = split_at(advance, told_apart(breaks, grid.t0, grid.clock(jnp.asarray(grid.num_steps))))
 
     def next_state(n, t, y_and_remainder):
         return advance(f, t, y_and_remainder, grid.dt, args)
