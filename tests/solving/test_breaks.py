@@ -143,7 +143,9 @@ def test_the_derivative_by_one_of_two_breaks_at_one_time_is_nan(adaptive, deriva
             return jeuler.solve_adaptive(field, 0.0, t1=1.0, args=b, breaks=breaks).y[-1]
         return jeuler.solve(field, 0.0, dt=0.1, num_steps=10, args=b, breaks=breaks).y[-1]
 
-    slopes = jax.jit(jax.vmap(derivative(end, argnums=(0, 1)), in_axes=(None, 0)))(0.5, jnp.array([0.2, 0.5, 0.53, 1.2]))
+    slopes = jax.jit(jax.vmap(derivative(end, argnums=(0, 1)), in_axes=(None, 0)))(
+        0.5, jnp.array([0.2, 0.5, 0.53, 1.2])
+    )
     np.testing.assert_allclose(slopes[0], [2.0, np.nan, 2.0, 2.0], atol=1e-12)
     np.testing.assert_allclose(slopes[1], [0.0, np.nan, 0.0, 0.0], atol=1e-12)
     assert float(end(0.5, 0.5)) == pytest.approx(0.0, abs=1e-14)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,10 @@ def advise_step(
     only an error far below the target was found, up to 400 numbers of steps are run from half as many on: the first
     near the target is taken, or else the fewest that meet it.
 
+    Where no pilot is fine enough to follow its order, as with Euler steps on an orbit near its centre, the leading term
+    of the error of a step of order 1 or 2 is added to the equation. An adaptive run of that says the error at any dt;
+    it is believed if it ends where a pilot run does, within a twentieth of the error there.
+
     The roundoff floor is measured on runs in float32 beside those in float64. For a y0 in float32 it was within a
     factor 3 of the floor that runs show in 36 of 37 cases (seven problems, three steps, plain and compensated) and 5 in
     the last; for one in float64 it is carried over by the ratio of the two eps, and an order of magnitude. Never more
@@ -184,6 +189,8 @@ class _Answer:
             search.look_at_stability(known.states[:-1:2], known.times[:-1:2])
             if search.bound * search.most >= search.interval and (found := search.uneven(known.final)) is not None:
                 return self.uneven(known.final, *found)
+            if ladder is None and (led := search.by_leading_term(known)) is not None:
+                return self.led(known.final, *led)
         return self.refusal(self.no_answer(ladder) + self.remedy())
 
     def no_answer(self, ladder: Ladder | None) -> str:
@@ -210,12 +217,29 @@ class _Answer:
 
     def answer(self, ladder: Ladder) -> StepAdvice:
         search = self.search
-        target, scale = search.target(ladder), search.scale(ladder.best)
+        target = search.target(ladder)
         seen = ladder.errors()[-1] <= AIM * target
         num_steps, error = search.fewest(ladder) if seen else search.predicted(ladder)
         if seen and error < target / FACTOR and not self.near_instability(num_steps):
             final: Any = ladder.best if search.reference is None else search.reference.final
             num_steps, error = search.uneven(final, start=max(1, num_steps // 4)) or (num_steps, error)
+        if error < target / FACTOR:
+            how = lambda: self.far_below(ladder.best, num_steps, target / error if error > 0 else math.inf)  # noqa: E731
+        elif seen:
+            how = lambda: "confirmed by a pilot run of that dt"  # noqa: E731
+        else:
+            how = lambda: "predicted by the order of the step from pilot runs"  # noqa: E731
+        return self.judged(ladder, num_steps, error, how)
+
+    def led(self, final: Any, num_steps: int, error: float, seen: int) -> StepAdvice:
+        """An answer far beyond the pilots, by the leading term of the error along an adaptive run."""
+        ladder = Ladder(self.search.order, [seen], [self.search.pilot(seen)[-1]], final, 0.0)
+        how = f"predicted by the leading term of the error along an adaptive run, as a run of {seen:,} steps bears out"
+        return self.judged(ladder, num_steps, error, lambda: how)
+
+    def judged(self, ladder: Ladder, num_steps: int, error: float, how: Callable[[], str]) -> StepAdvice:
+        """The answer, if roundoff and the clock allow it."""
+        search, scale = self.search, self.search.scale(ladder.best)
         rounding = search.rounding(ladder)
         self.floor, _ = rounding.floor(error / scale * num_steps**search.order, search.order)
         total = error / scale + rounding.after(num_steps)
@@ -230,15 +254,9 @@ class _Answer:
                 f"the target asks for {num_steps:.3g} steps, more than the clock can count; "
                 f"use {self.finer_step()} or an adaptive solver"
             )
-        if error < target / FACTOR:
-            how = self.far_below(ladder.best, num_steps, target / error if error > 0 else math.inf)
-        elif seen:
-            how = "confirmed by a pilot run of that dt"
-        else:
-            how = "predicted by the order of the step from pilot runs"
-            if num_steps > 10_000_000 and search.order == 1:
-                how += "; heun_step or rk4_step would need far fewer"
-        reason = f"{num_steps:,} steps: {how}"
+        reason = f"{num_steps:,} steps: {how()}"
+        if num_steps > 10_000_000 and search.order == 1 and "predicted" in reason:
+            reason += "; heun_step or rk4_step would need far fewer"
         return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
 
     def uneven(self, final: Any, num_steps: int, error: float) -> StepAdvice:

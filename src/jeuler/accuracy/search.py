@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -11,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from jeuler._core import trees
-from jeuler._core.precision import cast, double_precision, flat, flat_rows
-from jeuler.accuracy.pilot import SAMPLES, Ladder, Pilot, distance, norm
+from jeuler._core.precision import double_precision, flat
+from jeuler.accuracy.known_end import Reference, find_reference
+from jeuler.accuracy.leading import LARGEST_ORDER, LeadingError
+from jeuler.accuracy.pilot import Ladder, Pilot, distance, norm
 from jeuler.accuracy.roundoff import Rounding
-from jeuler.solving._adaptive import solve_adaptive
 from jeuler.steps.explicit import Step, VectorField
-from jeuler.steps.extrapolated import extrapolated_euler
 from jeuler.steps.implicit import linearly_implicit_euler_step
 from jeuler.steps.stability import Linearisation
 
@@ -31,31 +30,17 @@ FINENESS = 1e-3  # part of the number of steps below which the search makes no d
 TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
 REGULAR = 0.25  # and the observed order be this close to the step's own, to predict beyond the pilots
 OFF = 0.93, 0.79, 0.61  # parts of the finest rung: numbers of steps that share no pattern with it
+NONE = 1e-3  # part of the target that is no error
 EVEN = 2.5  # times the error that the order of the step tells of them
 BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
 ACCIDENT = 3  # times the fewest steps at most, for an error that is no accident of the grid
 FINER, FINE = 1.1, 1.02  # from one number of steps to the next where errors are uneven, many or few
 BETWEEN = 20, 400  # numbers of steps at least and at most, where the error of all these was far below the target
-REFERENCE_RTOL = 1e-8, 1e-11, 1e-13  # of adaptive runs; the first that agrees with the one before is the reference
-REFERENCE_STEPS, STIFF_REFERENCE_STEPS = 65_536, 8_192
-STIFF_STEP = extrapolated_euler(6, step=linearly_implicit_euler_step)
-STIFF_WORDS = "solve_adaptive with step=extrapolated_euler(6, step=linearly_implicit_euler_step)"
 NEAR_ENOUGH = 4  # an answer of up to this part of the longest pilot run is run itself, not predicted
 DOUBLINGS = 64  # times the steps that stability asks for, to see how the error falls from there on
 ROUGH = 2**18  # steps of the longest run in float32
-
-
-@dataclasses.dataclass(frozen=True)
-class Reference:
-    """States of an adaptive run that is known well enough, and how to make one like it."""
-
-    times: np.ndarray
-    states: np.ndarray
-    words: str
-
-    @property
-    def final(self) -> np.ndarray:
-        return self.states[-1]
+FOLLOWS = 0.05  # part of an error by which the end of a run may miss that of the modified equation
+TINY = 1e-290  # a final state below this has no scale of its own
 
 
 class Search:
@@ -124,7 +109,8 @@ class Search:
 
     def scale(self, final: Any) -> float:
         """The unit of the target, in the units of the state."""
-        return (norm(final) or 1.0) if self.relative else 1.0
+        size = norm(final)
+        return size if self.relative and not size < TINY else 1.0
 
     def target(self, ladder: Ladder) -> float:
         """The target in the units of the state."""
@@ -257,7 +243,7 @@ class Search:
                 return False
         elif ladder.error_of(self.reference.final) > known:
             return False
-        floor = 1e-12 * norm(ladder.finals[-1]) + 2 * ladder.doubt
+        floor = 1e-12 * norm(ladder.finals[-1]) + 2 * ladder.doubt + NONE * self.target(ladder)
         for part in OFF:
             num_steps = round(part * finest)
             expected = error * (finest / num_steps) ** self.order
@@ -267,41 +253,39 @@ class Search:
 
     @functools.cached_property
     def reference(self) -> Reference | None:
-        """An adaptive run, explicit or else linearly implicit, if two tolerances agree well enough to judge the target.
+        """An adaptive run that is known well enough to judge the target."""
+        tolerance, most = TRUST * self.error, max(256, self.planned // 8)
+        problem = self.f, self.start, self.t0, self.t1, self.args, self.breaks
+        known, self.disagreeing = find_reference(problem, most, lambda end: tolerance * self.scale(end))
+        return known
 
-        The states on its way say where the equation is stiff.
+    def by_leading_term(self, known: Reference) -> tuple[int, float, int] | None:
+        """Steps far beyond the pilots, their error, and those of a pilot run that bears it out.
+
+        The error is that of the modified equation, which the step follows but for terms of one order more. It is
+        believed where a pilot run ends where that equation does: within a twentieth of the error there.
         """
-        times = self.t0 + self.interval * np.arange(1, SAMPLES + 1) / SAMPLES
+        if self.order > LARGEST_ORDER or self.breaks:
+            return None
+        aim, seen = AIM * self.error * self.scale(known.final), self.most
         with double_precision():
-            y0, args = cast(self.start, np.float64), cast(self.args, np.float64)
-            size = max(norm(flat(y0)), 1e-3)
-            for step, most, words in (
-                (None, REFERENCE_STEPS, "solve_adaptive"),
-                (STIFF_STEP, STIFF_REFERENCE_STEPS, STIFF_WORDS),
-            ):
-                before = None
-                for rtol in REFERENCE_RTOL:
-                    run = solve_adaptive(
-                        self.f,
-                        y0,
-                        t0=self.t0,
-                        t1=times,
-                        args=args,
-                        step=step,
-                        rtol=rtol,
-                        atol=rtol * size,
-                        max_steps=min(most, max(256, self.planned // 8)),
-                        breaks=self.breaks,
-                    )
-                    states = flat_rows(run.y)[1:]
-                    if not np.all(np.isfinite(states[-1])):
-                        break
-                    if before is not None:
-                        if distance(before, states[-1]) <= TRUST * self.error * self.scale(states[-1]):
-                            return Reference(times, states, words)
-                        self.disagreeing = True
-                    before = states[-1]
-                    size = min(size, norm(before) or size)  # what decays is known in its own terms
+            ends = LeadingError(self.f, self.start, self.t0, self.t1, self.args, self.step, known.step)
+            exact = ends(0.0)
+            error_of = lambda n: distance(ends(self.interval / n), exact)  # noqa: E731
+            if not distance(exact, known.final) <= TRUST * aim:
+                return None
+            while not distance(self.pilot(seen)[-1], ends(self.interval / seen)) <= FOLLOWS * error_of(seen):
+                seen *= 2
+                if seen > self.ceiling:
+                    return None
+            num_steps = seen
+            for _ in range(8):
+                error = error_of(num_steps)
+                if NEAR * aim <= error <= aim:
+                    return num_steps, error, seen
+                if not np.isfinite(error):
+                    return None
+                num_steps = math.ceil(num_steps * (error / (0.95 * aim)) ** (1 / self.order))
         return None
 
     def uneven(self, final: np.ndarray, start: int = 0) -> tuple[int, float] | None:
