@@ -19,9 +19,16 @@ STEPS = {
     "Heun": jeuler.heun_step,
     "RK4": jeuler.rk4_step,
     "extrapolated": jeuler.extrapolated_euler(3),
+    "midpoint": jeuler.implicit_midpoint_step,
     "implicit": jeuler.implicit_euler_step,
     "linearly implicit": jeuler.linearly_implicit_euler_step,
+    "extrapolated, linearly implicit": jeuler.extrapolated_euler(3, step=jeuler.linearly_implicit_euler_step),
 }
+APART, TOGETHER = tuple(STEPS)[:6], tuple(STEPS)[6:]  # those that solve with contact have it in their program
+FIRST_ORDER = ("euler", "symplectic", "implicit", "linearly implicit")
+SPEEDS = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
+QUICK = {"xla_cpu_use_fusion_emitters": False}  # compiled in half the time; and where few values are run, also:
+UNOPTIMISED = QUICK | {"xla_backend_optimization_level": 0}
 SHAPES = {  # balls, whether they collide, what else is there, kinds of scene
     "two balls, floor": (2, False, "plane", ("grid", "floor", "slope")),
     "two balls, floor and wall": (2, True, "planes", ("grid", "floor", "row", "stack", "corner", "slope")),
@@ -49,12 +56,8 @@ def scene_of(shape, numbers):
     return jeuler.Scene((jeuler.Gravity(numbers["gravity"]),), (contact,))
 
 
-def run(shape, numbers, method):
+def run(shape, numbers, step):
     """A weighted sum of the last positions; and the whole run."""
-
-    def step(f, t, y, dt, args):
-        return jax.lax.switch(method, [lambda y, s=s: s(f, t, y, dt, args) for s in STEPS.values()], y)
-
     state = jeuler.ParticleState(numbers["position"], numbers["velocity"], numbers["mass"])
     solution = jeuler.simulate(scene_of(shape, numbers), state, dt=numbers["dt"], num_steps=NUM_STEPS, step=step)
     weights = np.random.default_rng(1).normal(size=state.position.shape).astype(state.position.dtype)
@@ -62,59 +65,60 @@ def run(shape, numbers, method):
 
 
 @functools.cache
-def programs(shape):
-    """Of a batch: the runs; the sums; their gradients; (sums, runs, gradients) at once. Of (numbers, number of a step)."""
+def programs(shape, steps, few=False):
+    """Of a batch of scenes and the number of one of these steps: the sums; (sums, runs, gradients by reverse mode);
+    and the derivatives along ``direction`` by forward mode."""
+
+    def summed(motion, numbers, method):
+        def step(f, t, y, dt, args):
+            return jax.lax.switch(method, [lambda y, s=s: STEPS[s](f, t, y, dt, args) for s in steps], y)
+
+        step.solves_contact = not set(steps) <= set(APART)
+        total, solution = run(shape, numbers | motion, step)
+        y = solution.y
+        return total, (y.position, y.velocity, solution.unresolved_contacts, solution.first_nonfinite)
 
     def value(numbers, method):
-        return run(shape, numbers, method)[0]
+        return summed({}, numbers, method)[0]
 
-    def gradient(motion, numbers, method):
-        return value(numbers | motion, method)
-
-    def gradients(numbers, method):
+    def reverse(numbers, method):
         motion = {name: numbers[name] for name in ("position", "velocity")}
-        return jax.grad(gradient)(motion, numbers, method)
+        (total, runs), gradient = jax.value_and_grad(summed, has_aux=True)(motion, numbers, method)
+        return total, runs, jnp.stack([gradient["position"], gradient["velocity"]])
 
-    def whole(numbers, method):
-        _, solution = run(shape, numbers, method)
-        y = solution.y
-        return y.position, y.velocity, solution.unresolved_contacts, solution.first_nonfinite
-
-    def everything(numbers, method):
+    def forward(numbers, method):
         motion = {name: numbers[name] for name in ("position", "velocity")}
+        direction = {"position": numbers["direction"][0], "velocity": numbers["direction"][1]}
+        return jax.jvp(lambda motion: summed(motion, numbers, method)[0], (motion,), (direction,))[1]
 
-        def summed(motion):
-            total, solution = run(shape, numbers | motion, method)
-            return total, (solution.y.position, solution.y.velocity, solution.unresolved_contacts)
-
-        (total, runs), gradient = jax.value_and_grad(summed, has_aux=True)(motion)
-        return total, runs, gradient
-
-    return [jax.jit(jax.vmap(f, (0, None))) for f in (whole, value, gradients, everything)]
+    options = UNOPTIMISED if few else QUICK
+    how = ((value, QUICK), (reverse, options), (forward, options))
+    return [jax.jit(jax.vmap(f, (0, None)), compiler_options=options) for f, options in how]
 
 
-def draw(random, shape):
+def draw(random, shape, grid=RADIUS, speeds=SPEEDS):
     """The numbers of one scene without overlaps."""
     count, _, _, kinds = SHAPES[shape]
     while True:
-        numbers = drawn(random, count, random.choice(kinds))
+        numbers = drawn(random, count, random.choice(kinds), grid, speeds)
         if not overlaps(shape, numbers):
             return numbers
 
 
-def drawn(random, count, kind):
+def drawn(random, count, kind, grid, speeds):
     dt = random.choice([0.01, 1 / 60, 0.02, 1 / 30])
     up = np.array(random.choice([(0.0, 1.0), (-0.6, 0.8), (-0.5, np.sqrt(0.75))]) if kind == "slope" else (0.0, 1.0))
     wall = np.array(random.choice([(1.0, 0.0), (0.6, 0.8)]) if kind == "corner" else (1.0, 0.0))
-    along, speeds = np.array([up[1], -up[0]]), np.array([-1.0, -0.5, 0.0, 0.0, 0.5, 1.0])
+    along = np.array([up[1], -up[0]])
     if kind == "grid":
-        position = RADIUS * np.stack([random.integers(1, 9, count), random.integers(1, 7, count)], axis=1)
+        wide, high = (max(3, round(size / grid)) for size in (0.9, 0.7))
+        position = grid * np.stack([random.integers(1, wide, count), random.integers(1, high, count)], axis=1)
     elif kind == "stack":
         position = RADIUS * np.stack([np.full(count, random.integers(1, 4)), 1 + 2 * np.arange(count)], axis=1)
     else:  # in a row on the floor, or on the slope; apart by multiples of what a speed of 1 goes in a step, or touching
-        gaps = random.choice([0.0, 0.0, 1.0, 2.0, 3.0, 5.0], count) * random.choice([dt, RADIUS])
+        gaps = random.choice([0.0, 0.0, 1.0, 2.0, 3.0, 5.0], count) * random.choice([dt, grid])
         height = 3 if kind == "row" else 1
-        way = RADIUS * (1 + 2 * np.arange(count)) + np.cumsum(gaps) + random.choice([0.0, RADIUS, 0.25])
+        way = RADIUS * (1 + 2 * np.arange(count)) + np.cumsum(gaps) + random.choice([0.0, grid, 0.25])
         position = way[:, None] * along + height * RADIUS * up
         if kind == "corner":
             position[0] = corner(wall)
@@ -166,7 +170,7 @@ def differences(program, numbers, method, at_once=None):
     shape = (size * points, *motion.shape[2:])
     flat = moved.reshape(size * points, 2, -1)
     of_all |= {"position": flat[:, 0].reshape(shape), "velocity": flat[:, 1].reshape(shape)}
-    values = np.asarray(in_chunks(program, of_all, method, at_once)).reshape(size, points)
+    values = in_chunks(program, of_all, method, at_once).reshape(size, points)
     slopes = (values[:, 1:] - values[:, :1]).reshape(size, 4, parameters) / actual
     return np.moveaxis(slopes, 1, 0).reshape(4, *motion.shape)
 
@@ -183,15 +187,25 @@ def in_chunks(program, numbers, method, at_once):
     return jax.tree.map(lambda *x: np.concatenate(x)[:total], *parts)
 
 
+def agree(slopes):
+    """Where four one-sided differences agree among themselves, (scene, 2, ball, dim)."""
+    return np.ptp(slopes, axis=0) < ALIKE[slopes.dtype] * (1 + np.max(np.abs(slopes), axis=0))
+
+
 def wrong_gradients(gradient, slopes):
     """Where four one-sided differences agree among themselves, and the gradient not with them: (scene, 2, ball, dim)."""
-    alike, middle = ALIKE[slopes.dtype], np.mean(slopes, axis=0)
     size = 1 + np.max(np.abs(slopes), axis=0)
-    agree = np.ptp(slopes, axis=0) < alike * size
-    return agree & ~(np.abs(gradient - middle) < 2 * alike * size)
+    return agree(slopes) & ~(np.abs(gradient - np.mean(slopes, axis=0)) < 2 * ALIKE[slopes.dtype] * size)
 
 
-def rise_of_energy(numbers, position, velocity, method):
+def disagree(gradient, numbers, forward):
+    """Where the derivative along ``direction`` is another by reverse than by forward mode, (scene,)."""
+    parts = (gradient * numbers["direction"]).reshape(len(gradient), -1)
+    size = 1 + np.sum(np.abs(parts), axis=1)
+    return ~(np.abs(np.sum(parts, axis=1) - forward) < ALIKE[gradient.dtype] * size)
+
+
+def rise_of_energy(numbers, position, velocity, step):
     """The most that the energy of each scene rises over any that it had before; and what the step's order allows, J.
 
     First-order steps follow a parabola with a velocity that is off by dt g / 2; a landing is cut short by less than dt g.
@@ -203,6 +217,5 @@ def rise_of_energy(numbers, position, velocity, method):
     rise = np.max(energy - np.minimum.accumulate(energy, axis=1), axis=1)
     g = np.linalg.norm(gravity, axis=1, keepdims=True)
     total, most = np.sum(mass, axis=1, keepdims=True), np.max(speed, axis=(1, 2))[:, None]
-    first = list(STEPS)[method] in ("euler", "symplectic", "implicit", "linearly implicit")
-    allowed = total * ((g * dt) ** 2 + (g * dt * most if first else 0))
+    allowed = total * ((g * dt) ** 2 + (g * dt * most if step in FIRST_ORDER else 0))
     return rise, allowed[:, 0] + 64 * np.finfo(position.dtype).eps * np.max(np.abs(energy), axis=1)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jeuler._core.vectors import length
+from jeuler._core.vectors import length, unit
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import TOUCH, Contacts, Look
@@ -223,27 +223,37 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
 
 
 def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Array:
-    """What of a change of the relative bend, (contact, dim), falls to each particle, (particle, dim).
+    """What of a change of the relative bend along the normals, (contact, dim), falls to each particle, (particle, dim).
 
-    By the masses; who would be pushed against what holds it is held, and the other partner takes all.
+    By the masses. Who would be pushed against what holds it, in the direction m, gives way along that alone:
+
+        F (w + w' (1 - (n.m)^2)) = change,   with w n F for the free partner and -w' (n - (n.m) m) F for the held one
     """
 
-    def free(support, towards):
-        return jnp.sum(support * towards, axis=-1) >= -0.5 * length(support)
+    def ways(partner, towards):  # in which each can give way
+        hold = unit(partner(path.support))
+        against = jnp.sum(hold * towards, axis=-1, keepdims=True)
+        return towards - jnp.where(against < -1e-6, against, 0) * hold
 
-    first, second = contacts.first(contacts.inverse_mass), contacts.second(contacts.inverse_mass)
-    first = jnp.where(free(contacts.first(path.support), normal), first, 0)
-    second = jnp.where(free(contacts.second(path.support), -normal), second, 0)
-    both = first + second
-    change = change * jnp.where(both > 0, 1 / jnp.where(both > 0, both, 1), 0)[:, None]
-    return contacts.gather(first[:, None] * change, second[:, None] * change)
+    first = contacts.first(contacts.inverse_mass)[:, None] * ways(contacts.first, normal)
+    second = contacts.second(contacts.inverse_mass)[:, None] * ways(contacts.second, -normal)
+    response = jnp.sum((first - second) * normal, axis=-1, keepdims=True)
+    free = response > 0.1 * contacts.both(jnp.add, contacts.inverse_mass)[:, None]  # else both are held: by what is hit
+    force = jnp.where(free, jnp.sum(change * normal, axis=-1, keepdims=True) / jnp.where(free, response, 1), 0)
+    return contacts.gather(first * force, -second * force)
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:
     """Whether a particle with this dx/ds at s goes off what held it and does not fall back in this step."""
+    excess, rounding = off_its_support(path, s, speed)
+    return (excess > rounding)[:, None]
+
+
+def off_its_support(path: Path, s: Array, speed: Array) -> tuple[Array, Array]:
+    """By how much dx/ds, m a step, is more than what falls back in this step; and what of that may be rounding."""
     falls_back = 0.5 * (1 - s) * length(path.support)
     rounding = 16 * jnp.finfo(s.dtype).eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1))
-    return (along(speed, path.support) - path.ride > falls_back + rounding)[:, None]
+    return along(speed, path.support) - path.ride - falls_back, rounding
 
 
 def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Array:
@@ -259,9 +269,11 @@ def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Arra
     return y
 
 
-def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: int) -> tuple[Events, Path, Array]:
+def schedule(
+    contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: int
+) -> tuple[Events, Path, Array, Array]:
     """The impacts of all rounds and of one more, which rest, each leaf (round, particle); the paths after them; and the
-    number of impacts that were made to rest."""
+    numbers of impacts that were made to rest, and of those whose outcome rounding decides."""
     none = jnp.full(contacts.particles, -1, jnp.int32)
     no = jnp.zeros(contacts.particles, bool)
     empty = Events(none, jnp.zeros_like(path.s), no, no)
@@ -270,25 +282,60 @@ def schedule(contacts: Contacts, path: Path, slow: Array, theta: Array, rounds: 
     def play(path, found, k):
         events = choose(contacts, found)
         events = events._replace(plastic=events.plastic | (k == rounds))
-        return strike(contacts, path, events, found.s, found.look, theta), events
+        after = strike(contacts, path, events, found.s, found.look, theta)
+        return after, events, undecided(contacts, path, after, events, found)
 
     def one(state):
-        path, record, k, _, left = state
+        path, record, k, _, left, unsure = state
         found = next_impacts(contacts, path, slow)
         happens = jnp.isfinite(found.s)
         stopped = (k == rounds) & happens & ~found.plastic
         left = left + jnp.sum(found.unclear | stopped).astype(jnp.int32)
-        path, events = lax.cond(anywhere(happens), play, lambda path, *_: (path, empty), path, found, k)
+        path, events, more = lax.cond(
+            anywhere(happens), play, lambda path, *_: (path, empty, jnp.int32(0)), path, found, k
+        )
         record = jax.tree.map(lambda all_, x: all_.at[k].set(x, mode="drop"), record, events)
-        return path, record, k + 1, jnp.any(happens), left
+        return path, record, k + 1, jnp.any(happens), left, unsure + more
 
     def go_on(state):
-        _, _, k, any_left, _ = state
+        _, _, k, any_left, *_ = state
         return any_left & (k <= rounds)
 
-    start = path, record, jnp.int32(0), jnp.asarray(True), jnp.int32(0)
-    path, record, _, _, left = lax.while_loop(go_on, one, start)
-    return record, path, left
+    start = path, record, jnp.int32(0), jnp.asarray(True), jnp.int32(0), jnp.int32(0)
+    path, record, _, _, left, unsure = lax.while_loop(go_on, one, start)
+    return record, path, left, unsure
+
+
+def undecided(contacts: Contacts, path: Path, after: Path, events: Events, found: Found) -> Array:
+    """How many impacts of a round have an outcome that rounding decides, (), int32."""
+    if contacts.alone:
+        return jnp.int32(0)
+    orders, leaves = of_an_order(contacts, path, after, events, found), may_leave(path, after, events)
+    return (jnp.sum(orders) + jnp.sum(leaves)).astype(jnp.int32)
+
+
+def of_an_order(contacts: Contacts, path: Path, after: Path, events: Events, found: Found) -> Array:
+    """Which impacts, (contact,), that were not chosen are at the same time, within rounding, as one of their partners'
+    that was chosen, and another one after it: what happens depends on an order that rounding decides."""
+    look, chosen = found.look, events.contact >= 0
+    earliest = contacts.both(jnp.minimum, jnp.where(chosen, events.s, jnp.inf))
+    small = 2 * contacts.roundoff(path.x) / jnp.where(look.slope < 0, -look.slope, jnp.inf)
+    together = jnp.isfinite(found.s) & (found.s <= earliest + small) & ~met(contacts, events)
+    change = contacts.relative(after.jump - path.jump)
+    into = jnp.sum(change * look.normal, axis=-1)
+    along = length(change - into[:, None] * look.normal)
+    noticed = jnp.abs(into) + jnp.where(contacts.friction > 0, along, 0)
+    walls = jnp.arange(contacts.count) < contacts.walls
+    same = walls & contacts.first(chosen & (events.contact < contacts.walls))  # of two flush surfaces the order is one
+    same = same & (jnp.sum(contacts.first(look.normal[events.contact]) * look.normal, axis=-1) > 1 - 1e-4)
+    return together & ~same & (noticed * contacts.dt > 1e-3 * length(look.speed))
+
+
+def may_leave(path: Path, after: Path, events: Events) -> Array:
+    """Which particles, (particle,), an impact takes off what held them or not, as rounding decides."""
+    excess, rounding = off_its_support(path, after.s, after.way)
+    moved = jnp.abs(along(after.way, path.support) - path.ride)
+    return (events.contact >= 0) & (jnp.abs(excess) <= 4 * rounding) & (moved > 1e-3 * length(path.support))
 
 
 def go_through(contacts: Contacts, path: Path, events: Events, theta: Array) -> Path:

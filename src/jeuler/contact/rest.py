@@ -180,13 +180,15 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     else:
         rate = contacts.rate(active)
         start, error = checkpoint_name(_iterate(lax.stop_gradient(problem), small), REST)
-        unresolved = jnp.sum(active & (error > _tolerated(problem) + small)).astype(jnp.int32)
         w, q = start[:, :-1], start[:, -1]
         velocity, gap, _ = problem.at_end(w, q)
         presses = pressed(w, velocity)
         on = lax.stop_gradient(presses | ((q > 0) & ((gap < -small) | ~active)))
         overlap = jnp.where(presses, 0, small)
         u = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
+        off = lax.stop_gradient(problem.residual(u, rate, on, overlap))  # Newton's step may have ended it
+        off = jnp.minimum(error, jnp.maximum(length(off[:, :-1]) / rate, jnp.abs(off[:, -1])))
+        unresolved = jnp.sum(active & (off > _tolerated(problem) + small)).astype(jnp.int32)
     w, q = u[:, :-1], u[:, -1]
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)

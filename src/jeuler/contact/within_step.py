@@ -58,7 +58,7 @@ def _resolve(
     path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, load)
     contacts.lift_off(path)
     impacts = schedule(contacts, *lax.stop_gradient((path, slow, theta)), rounds)
-    events, after, left = checkpoint_name(impacts, IMPACTS)
+    events, after, left, undecided = checkpoint_name(impacts, IMPACTS)
     moved, jump = found(_end(after), lambda: _end(go_through(contacts, path, events, theta)))
     touched = (touched | after.hit)[:, None]
     position = jnp.where(touched, moved, x_free)
@@ -69,7 +69,7 @@ def _resolve(
         kick, shift = where_needed(left > 0, settle, unchanged, *operands)
         position, velocity = position + shift, velocity + kick
     position = jnp.where(lost[:, None], jnp.nan, position)  # a surface that cannot say where it is: announced
-    return position, velocity, unresolved + left + contacts.left_out
+    return position, velocity, unresolved + left + undecided + contacts.left_out
 
 
 def settle(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tuple[Array, Array]:
