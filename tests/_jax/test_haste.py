@@ -49,4 +49,9 @@ def test_a_run_in_haste_can_be_differentiated_batched_and_compiled_again(around)
 def test_runs_of_few_contacts_that_may_be_several_at_once_are_compiled_in_haste(colliders, pairs, long):
     floor = jeuler.contact.Plane([0.0], [1.0])
     contact = jeuler.Collisions((floor,) * colliders, pairs=[(k, k + 1) for k in range(pairs)], radius=0.1)
-    assert contact.is_long_code is long
+    assert contact.is_long_code(1000) is long
+
+
+@pytest.mark.parametrize(("balls", "long"), [(32, True), (33, False)])
+def test_so_are_runs_of_few_balls_that_find_each_other(balls, long):
+    assert jeuler.Collisions(pairs="near", radius=0.1).is_long_code(balls) is long

@@ -124,12 +124,10 @@ class Collisions:
     def writes(self) -> tuple[str, ...]:
         return ("unresolved_contacts",)
 
-    @property
-    def is_long_code(self) -> bool:
+    def is_long_code(self, particles: int) -> bool:
         """Whether compiling a run takes longer than it runs: contacts that may be several at once, and not many."""
-        if self.pairs == "near":
-            return False
-        return (len(self.colliders) > 1 or len(self.pairs) > 0) and len(self.pairs) <= FEW_PAIRS
+        pairs = particles if self.pairs == "near" else len(self.pairs)
+        return (len(self.colliders) > 1 or pairs > 0) and pairs <= FEW_PAIRS
 
     def _rounds(self) -> int:
         if self.max_bounces is not None:
@@ -146,9 +144,9 @@ class Collisions:
             check_collider(collider, dim)
 
 
-def has_long_code(effects: Sequence[Any]) -> bool:
+def has_long_code(effects: Sequence[Any], particles: int) -> bool:
     """Whether a run with these effects takes longer to compile than to run, by its contacts."""
-    return any(effect.is_long_code for effect in effects if isinstance(effect, Collisions))
+    return any(effect.is_long_code(particles) for effect in effects if isinstance(effect, Collisions))
 
 
 def _pairs(pairs: Any) -> tuple[tuple[int, int], ...] | Literal["near"]:

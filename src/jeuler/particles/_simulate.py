@@ -125,12 +125,12 @@ def simulate(
     if resume is not None:
         return Solution(*run_on_disk(_loop, inputs, settings, grid, resume, checkpoint_every, progress))
     found = run_in_chunks(_loop, inputs, settings, grid, progress)
-    return programs.call(_simulate, inputs, settings, _haste(scene)) if found is None else Solution(*found)
+    return programs.call(_simulate, inputs, settings, _haste(scene, state)) if found is None else Solution(*found)
 
 
-def _haste(scene: Scene) -> Haste:
+def _haste(scene: Scene, state: ParticleState) -> Haste:
     """A program of few contacts is small work and long code."""
-    return "some" if has_long_code(scene.effects) else "none"
+    return "some" if has_long_code(scene.effects, len(state.position)) else "none"
 
 
 def _simulate(*given: Any) -> Solution:
