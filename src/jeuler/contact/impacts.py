@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jeuler._core.vectors import length, unit
+from jeuler._core.vectors import length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import TOUCH, Contacts, Look
@@ -223,24 +223,20 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
 
 
 def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Array:
-    """What of a change of the relative bend along the normals, (contact, dim), falls to each particle, (particle, dim).
+    """What of a change of the relative bend, (contact, dim), falls to each particle, (particle, dim).
 
-    By the masses. Who would be pushed against what holds it, in the direction m, gives way along that alone:
-
-        F (w + w' (1 - (n.m)^2)) = change,   with w n F for the free partner and -w' (n - (n.m) m) F for the held one
+    By the masses; who would be pushed against what holds it is held, and the other partner takes all.
     """
 
-    def ways(partner, towards):  # in which each can give way
-        hold = unit(partner(path.support))
-        against = jnp.sum(hold * towards, axis=-1, keepdims=True)
-        return towards - jnp.where(against < -1e-6, against, 0) * hold
+    def free(support, towards):
+        return jnp.sum(support * towards, axis=-1) >= -0.5 * length(support)
 
-    first = contacts.first(contacts.inverse_mass)[:, None] * ways(contacts.first, normal)
-    second = contacts.second(contacts.inverse_mass)[:, None] * ways(contacts.second, -normal)
-    response = jnp.sum((first - second) * normal, axis=-1, keepdims=True)
-    free = response > 0.1 * contacts.both(jnp.add, contacts.inverse_mass)[:, None]  # else both are held: by what is hit
-    force = jnp.where(free, jnp.sum(change * normal, axis=-1, keepdims=True) / jnp.where(free, response, 1), 0)
-    return contacts.gather(first * force, -second * force)
+    first, second = contacts.first(contacts.inverse_mass), contacts.second(contacts.inverse_mass)
+    first = jnp.where(free(contacts.first(path.support), normal), first, 0)
+    second = jnp.where(free(contacts.second(path.support), -normal), second, 0)
+    both = first + second
+    change = change * jnp.where(both > 0, 1 / jnp.where(both > 0, both, 1), 0)[:, None]
+    return contacts.gather(first[:, None] * change, second[:, None] * change)
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:
