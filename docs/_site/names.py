@@ -27,6 +27,7 @@ PARTS = {  # the order in which a reader needs them
     "forces": "Forces",
     "effects": "Effects",
     "contact": "Contact",
+    "meshes": "Bodies from meshes",
     "samplers": "Samplers",
     "fitting": "Fitting",
     "observing": "What sensors show",
