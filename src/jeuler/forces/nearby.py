@@ -77,11 +77,15 @@ class _Nearby:
         has_neighbours: Array | None = None,
     ) -> Array:
         """The sum of what the neighbours exert; NaN where rows were never made."""
-        neighbours = self._rows_at(position, neighbours, neighbours_made_at, has_neighbours)
-        pairs = self._pairs(position, neighbours, has_neighbours)
+        rows = self._rows_at(position, neighbours, neighbours_made_at, has_neighbours)
+        total = self._total(rows, has_neighbours, position, velocity, mass)
+        return jnp.where(rows[:, :1] == NOT_BUILT, jnp.nan, total)
+
+    def _total(self, rows: Array, made: Array | None, position: Array, velocity: Array, mass: Array) -> Array:
+        """What those in the rows exert, (particle, dim)."""
+        pairs = self._pairs(position, rows, made)
         shares = self._shares(pairs, position, split(velocity), mass)
-        total = stack([pairs.sum(share) for share in shares])
-        return jnp.where(neighbours[:, :1] == NOT_BUILT, jnp.nan, total)
+        return stack([pairs.sum(share) for share in shares])
 
     def _rows_at(self, position: Array, rows: Array, made_at: Array | None, has: Array | None) -> Array:
         """The rows for these positions, those of the state or new ones."""

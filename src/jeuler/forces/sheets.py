@@ -15,7 +15,7 @@ from jeuler._core.indices import particle_groups
 from jeuler._core.triangles import nearest_weights
 from jeuler._core.vectors import direction
 from jeuler.forces.nearby import _Nearby
-from jeuler.graphs.cells import NOT_BUILT, nearest_image
+from jeuler.graphs.cells import nearest_image
 
 
 @component(static=("triangles",), parameters=("thickness", "ks", "kd"), positive=("thickness", "ks", "kd"))
@@ -69,19 +69,9 @@ class TriangleContact(_Nearby):
         object.__setattr__(self, "triangles", triangles)
         self._store("thickness", "ks", "kd")
 
-    def __call__(
-        self,
-        t: Any,
-        position: Array,
-        velocity: Array,
-        mass: Array,
-        neighbours: Array,
-        neighbours_made_at: Array | None = None,
-        has_neighbours: Array | None = None,
-    ) -> Array:
-        rows = self._rows_at(position, neighbours, neighbours_made_at, has_neighbours)
+    def _total(self, rows: Array, made: Array | None, position: Array, velocity: Array, mass: Array) -> Array:
         triangles = np.asarray(self.triangles)
-        seen, here = self._seen(rows, triangles, has_neighbours)
+        seen, here = self._seen(rows, triangles, made)
         corners = jnp.asarray(triangles)[seen]  # (particle, place, 3)
         s, ks, kd = (x.astype(position.dtype) for x in (self.thickness, self.ks, self.kd))
         w = nearest_weights(position[:, None], self._near(position[:, None], position[corners]))
@@ -91,8 +81,7 @@ class TriangleContact(_Nearby):
         size = jnp.where(here, jnp.maximum(s - r[..., 0], 0) * (ks - kd / s * approach), 0)
         push = size[..., None] * u
         total = jnp.sum(push, axis=1).at[corners].add(-w[..., None] * push[..., None, :])
-        wrong = (rows[:, :1] == NOT_BUILT) | (self._longest(position, triangles) + s > self.neighbours.cutoff)
-        return jnp.where(wrong, jnp.nan, total)
+        return jnp.where(self._longest(position, triangles) + s > self.neighbours.cutoff, jnp.nan, total)
 
     def _seen(self, rows: Array, triangles: np.ndarray, made: Array | None) -> tuple[Array, Array]:
         """The triangles of the neighbours of each particle, (particle, place), and whether there is one that acts."""
