@@ -63,7 +63,8 @@ class Record:
 
         def write(path: str) -> None:
             with open(path, "wb") as file:
-                np.savez(file, _mark=self.mark, _part=part, _stage=stage, _history=np.asarray(history), **arrays)  # type: ignore[arg-type]
+                numbers: dict[str, Any] = {"_part": part, "_stage": stage, "_history": np.asarray(history), **arrays}
+                np.savez(file, _mark=self.mark, **numbers)
 
         write_atomically(self.path, write)
         self.last = time.monotonic()
