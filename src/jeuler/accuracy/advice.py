@@ -14,10 +14,10 @@ from jeuler._core.arguments import says_what_to_write
 from jeuler._core.component import result
 from jeuler._core.precision import flat
 from jeuler.accuracy.asked import Asked
-from jeuler.accuracy.pilot import Ladder
+from jeuler.accuracy.pilot import Ladder, distance
 from jeuler.accuracy.roundoff import COUNTER
 from jeuler.accuracy.search import AIM, FACTOR, Search
-from jeuler.steps.explicit import Step, VectorField, euler_step
+from jeuler.steps.explicit import Step, VectorField, euler_step, rk4_step
 
 PyTree = Any
 
@@ -25,6 +25,8 @@ PILOT_WORK = 2**25  # numbers advanced in the longest pilot run
 IMPLICIT_WORK = 16  # times the work of an explicit step that of one which solves equations is taken to be
 LONGER = 8  # times that work where stability asks for it
 FEW = 64  # steps: one fewer may make a difference
+MANY = 10_000_000  # steps: what does with far fewer is looked for
+ROUGHLY = 2**14  # steps of RK4, to see whether its fewer roundings meet a target
 LARGER = 0.9  # part of the steps at whose dt instability is to be seen if it is what sets dt:
 NEAR_LIMIT, NEAR_LIMIT_UNEVEN = 0.2, 0.5  # of the stable dt, more where jumps make errors grow too; and it grows by
 UNSTABLE = 4.0  # times the error that the order says
@@ -114,7 +116,8 @@ def advise_step(
       t0: initial time, s.
       args: passed to f.
       step: the method.
-      relative: the target is relative to the norm of the state at t1 (True; where that is 0 it is not), or in the units
+      relative: the target is relative to the norm of the state at t1 (True; where that is 0 but for
+        roundoff it is not, and the reason says so), or in the units
         of the state (False).
       compensated: advise for compensated sums.
       breaks: times at which f may jump, s, t0 and t1 among them, for a run with the same `solve(..., breaks=)`.
@@ -178,13 +181,22 @@ class _Answer:
             return self.refusal(
                 f"{self.name} makes an oscillation grow at every dt, too far for any use at t1; use rk4_step"
             )
+        known = search.reference
+        if search.relative and known is not None and not known.vanishes:
+            lost = known.roundoff / search.scale(known.final)
+            if lost > search.error:
+                return self.refusal(
+                    f"roundoff: the state at t1 is so small beside those on the way there that rounding them in "
+                    f"float64 changes it by {lost:.1e} of its size; "
+                    f"give a target in the units of the state, relative=False",
+                    lost,
+                )
         start = 16
         while start * search.bound < search.interval and 2 * start <= search.most:
             start *= 2
         ladder, even = search.confirmed(start) if 2 * start <= search.most else (None, False)
         if ladder is not None and even:
             return self.answer(ladder)
-        known = search.reference
         if known is not None:
             search.look_at_stability(known.states[:-1:2], known.times[:-1:2])
             if search.bound * search.most >= search.interval and (found := search.uneven(known.final)) is not None:
@@ -228,36 +240,71 @@ class _Answer:
         elif seen:
             how = lambda: "confirmed by a pilot run of that dt"  # noqa: E731
         else:
-            how = lambda: "predicted by the order of the step from pilot runs"  # noqa: E731
+            how = lambda: "predicted by the order of the step from pilot runs" + self.fewer(num_steps, ladder.best)  # noqa: E731
         return self.judged(ladder, num_steps, error, how)
 
     def led(self, final: Any, num_steps: int, error: float, seen: int) -> StepAdvice:
         """An answer far beyond the pilots, by the leading term of the error along an adaptive run."""
         ladder = Ladder(self.search.order, [seen], [self.search.pilot(seen)[-1]], final, 0.0)
         how = f"predicted by the leading term of the error along an adaptive run, as a run of {seen:,} steps bears out"
-        return self.judged(ladder, num_steps, error, lambda: how)
+        return self.judged(ladder, num_steps, error, lambda: how + self.fewer(num_steps, final))
 
     def judged(self, ladder: Ladder, num_steps: int, error: float, how: Callable[[], str]) -> StepAdvice:
         """The answer, if roundoff and the clock allow it."""
         search, scale = self.search, self.search.scale(ladder.best)
         rounding = search.rounding(ladder)
         self.floor, _ = rounding.floor(error / scale * num_steps**search.order, search.order)
+        if num_steps > COUNTER:
+            return self.refusal(
+                f"the target asks for {num_steps:.3g} steps, more than the clock can count" + self.remedy()
+            )
         total = error / scale + rounding.after(num_steps)
         if total > 1.25 * search.error:
             return self.refusal(
                 f"roundoff: in {search.dtype} {self.name} does not get below an error of about "
-                f"{self.floor:.1e}, above the target {search.error:.1e}; use {' or '.join(self.cures())}",
+                f"{self.floor:.1e}, above the target {search.error:.1e}; use {' or '.join(self.cures(ladder.best))}",
                 self.floor,
             )
-        if num_steps > COUNTER:
-            return self.refusal(
-                f"the target asks for {num_steps:.3g} steps, more than the clock can count; "
-                f"use {self.finer_step()} or an adaptive solver"
-            )
-        reason = f"{num_steps:,} steps: {how()}"
-        if num_steps > 10_000_000 and search.order == 1 and "predicted" in reason:
-            reason += "; heun_step or rk4_step would need far fewer"
+        return self.advised(num_steps, total, how(), ladder.best)
+
+    def advised(self, num_steps: int, total: float, how: str, final: Any) -> StepAdvice:
+        """An answer with what else there is to say of it."""
+        search = self.search
+        reason = f"{num_steps:,} step{'s' * (num_steps > 1)}: {how}{self.jumps(num_steps, final)}"
+        if search.vanishing and search.relative:
+            reason += "; the state at t1 is 0 but for roundoff, so the target is taken in the units of the state"
         return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
+
+    def fewer(self, num_steps: int, final: Any) -> str:
+        """What meets the target with far fewer steps, where these are many: a run that was made."""
+        search = self.search
+        if num_steps <= MANY:
+            return ""
+        if (
+            is_explicit(search.step)
+            and search.order < 4
+            and (fewer := search.steps_of(rk4_step, final, search.planned))
+        ):
+            return f"; rk4_step meets the target with {fewer:,} steps"
+        return "" if search.reference is None else f"; {search.reference.words} meets the target too"
+
+    def jumps(self, num_steps: int, final: Any) -> str:
+        """Words on an end of the interval where f jumps, if the error is far smaller with it among the breaks."""
+        search, ends = self.search, []
+        for name, t, inside in (("t0", search.t0, 1), ("t1", search.t1, -1)):
+            if t not in search.breaks and search.jumps_at(t, inside, final):
+                ends.append((name, t))
+        if not ends or num_steps > search.most:
+            return ""
+        breaks = tuple(sorted({*search.breaks, *(t for _, t in ends)}))
+        known = search.runs(search.step, np.float64, search.compensated, breaks)(num_steps)[-1]
+        better = search.error_after(num_steps, final) / max(
+            distance(known, final) / search.scale(final) / search.error, 1e-16
+        )
+        if not better > FACTOR:
+            return ""
+        where = " and ".join(f"{name}={t:g}" for name, t in ends)
+        return f"; f jumps at {where}: with that among the breaks the error is {better:.2g} times smaller"
 
     def uneven(self, final: Any, num_steps: int, error: float) -> StepAdvice:
         """An answer where errors do not follow the order: that of a run of the advised step itself."""
@@ -271,10 +318,8 @@ class _Answer:
             how = self.far_below(final, num_steps, better, NEAR_LIMIT_UNEVEN)
         else:
             how = "confirmed by a pilot run of that dt"
-        reason = (
-            f"{num_steps:,} steps: {how}; against an adaptive run, as the error was not seen to fall evenly with dt"
-        )
-        return StepAdvice(search.interval / num_steps, num_steps, total, search.stability, self.floor, True, reason)
+        how += "; against an adaptive run, as the error was not seen to fall evenly with dt"
+        return self.advised(num_steps, total, how, final)
 
     def far_below(self, final: Any, num_steps: int, better: float, part: float = NEAR_LIMIT) -> str:
         """Why an error is far below the target: as one step fewer misses it, or as larger dts grow or jump."""
@@ -307,14 +352,15 @@ class _Answer:
             return f"oscillations that {self.name} makes grow ask for {need}"
         return f"stability alone asks for {need}"
 
-    def finer_step(self) -> str:
-        return "heun_step, rk4_step" if self.search.order < 4 else "extrapolated_euler(8)"
-
-    def cures(self) -> list[str]:
-        """What takes roundoff further down."""
+    def cures(self, final: Any) -> list[str]:
+        """What takes roundoff further down; RK4 steps where a run in this precision meets the target."""
         search = self.search
+        if search.error < np.finfo(search.dtype).eps / 4:  # below the spacing of numbers
+            return ["float64"] if search.dtype == np.float32 else ["a larger target"]
         cures = [] if search.compensated or not hasattr(search.step, "increment") else ["compensated=True"]
-        return cures + (["float64"] if search.dtype == np.float32 else []) + [self.finer_step()]
+        cures += ["float64"] if search.dtype == np.float32 else []
+        cures += ["rk4_step"] if search.order < 4 and search.steps_of(rk4_step, final, ROUGHLY, search.dtype) else []
+        return cures or ["a larger target"]
 
     def refusal(self, reason: str, reachable: float = math.nan) -> StepAdvice:
         return StepAdvice(math.nan, 0, reachable, self.search.stability, self.floor, False, reason)

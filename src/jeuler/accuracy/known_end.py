@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jeuler._core import trees
 from jeuler._core.precision import cast, double_precision, flat, flat_rows
 from jeuler.accuracy.pilot import SAMPLES, distance, norm
 from jeuler.solving._adaptive import solve_adaptive
@@ -18,6 +22,12 @@ from jeuler.steps.implicit import linearly_implicit_euler_step
 RTOL = 1e-8, 1e-11, 1e-13  # of adaptive runs; the first that agrees with the one before is the reference
 DECAYING, SINKS = 32, 1e-3  # further runs at the last, while the end sinks to less than such a part of it
 MOST_STEPS, MOST_STIFF_STEPS = 65_536, 8_192
+JUMP = 1e-3  # part of f by which it does not change in a few units in the last place of the time
+SMALL, KICK = (
+    1e-6,
+    1e-6,
+)  # parts of a state: an end that may be roundoff alone, and what is added to see what becomes of it
+NOTHING, UNKNOWN = 10.0, 1000.0  # times the roundoff of an end that is nothing else: as runs agree on it or do not
 STIFF_STEP = extrapolated_euler(6, step=linearly_implicit_euler_step)
 STIFF_WORDS = "solve_adaptive with step=extrapolated_euler(6, step=linearly_implicit_euler_step)"
 
@@ -30,6 +40,8 @@ class Reference:
     states: np.ndarray
     words: str
     step: Step | None
+    roundoff: float = 0.0  # what rounding on the way makes of the end in float64, where that is small beside the way
+    vanishes: bool = False  # whether the end is nothing else
 
     @property
     def final(self) -> np.ndarray:
@@ -37,14 +49,16 @@ class Reference:
 
 
 def find_reference(
-    problem: tuple[Any, ...], max_steps: int, tolerance: Callable[[np.ndarray], float]
+    problem: tuple[Any, ...], max_steps: int, tolerance: Callable[[np.ndarray | None], float]
 ) -> tuple[Reference | None, bool]:
     """An adaptive run, explicit or else linearly implicit, if two tolerances agree to ``tolerance(end)``, or None.
 
     The states on its way say where the equation is stiff. What decays is known in its own terms: atol sinks with it.
+    An end that is 0 but for roundoff is known as soon as runs agree on it in the units of the state.
 
     Args:
       problem: (f, y0, t0, t1, args, breaks).
+      tolerance: of an end; of None, of one that vanishes.
     Returns: the run, and whether some came to different ends.
     """
     f, y0, t0, t1, args, breaks = problem
@@ -56,29 +70,59 @@ def find_reference(
             (None, MOST_STEPS, "solve_adaptive"),
             (STIFF_STEP, MOST_STIFF_STEPS, STIFF_WORDS),
         ):
-            before = None
+            common = {"args": args, "step": step, "max_steps": min(most, max_steps), "breaks": breaks}
+            run = lambda start, t0, t1, rtol, size, common=common: solve_adaptive(  # noqa: E731
+                f, start, t0=t0, t1=t1, rtol=rtol, atol=rtol * size, **common
+            )
+            known: Any = None  # the run before
             for count, rtol in enumerate((*RTOL, *DECAYING * RTOL[-1:]), start=1):
-                run = solve_adaptive(
-                    f,
-                    y0,
-                    t0=t0,
-                    t1=times,
-                    args=args,
-                    step=step,
-                    rtol=rtol,
-                    atol=rtol * size,
-                    max_steps=min(most, max_steps),
-                    breaks=breaks,
-                )
-                states = flat_rows(run.y)[1:]
-                if not np.all(np.isfinite(states[-1])):
+                made = run(y0, t0, times, rtol, size)
+                finite = bool(np.all(np.isfinite(flat_rows(made.y)[-1])))
+                before, known = known, made if finite else known
+                if before is None and not finite:
                     break
                 if before is not None:
-                    if distance(before, states[-1]) <= tolerance(states[-1]):
-                        return Reference(times, states, words, step), disagreeing
+                    old, end = (flat_rows(each.y)[-1] for each in (before, known))
+                    change = distance(old, end)
+                    agreed, sinks = finite and change <= tolerance(end), finite and norm(end) < SINKS * norm(old)
+                    if agreed or (count >= len(RTOL) and not sinks):
+                        roundoff = roundoff_of_end(run, known.y, times, size)
+                        vanishes = norm(end) <= (NOTHING if agreed else UNKNOWN) * roundoff
+                        if agreed or (vanishes and change <= tolerance(None)):
+                            states = flat_rows(known.y)[1:]
+                            return Reference(times, states, words, step, roundoff, vanishes), disagreeing
                     disagreeing = True
-                    if count >= len(RTOL) and not norm(states[-1]) < SINKS * norm(before):
+                    if not finite or (count >= len(RTOL) and not sinks):
                         break
-                before = states[-1]
-                size = min(size, norm(before) or size)
+                size = min(size, norm(flat_rows(known.y)[-1]) or size)
     return None, disagreeing
+
+
+def roundoff_of_end(run: Callable[..., Any], y: Any, times: np.ndarray, size: float) -> float:
+    """What rounding of the states on the way makes of the end, where that is far smaller than they are; else 0.0.
+
+    Each state is moved by a millionth of its size, and the run gone on with; rounding moves it by eps of its size. The
+    runs are made in terms of ``size``, or if they are not finished so, of the state that they begin at.
+    """
+    rows = flat_rows(y)
+    sizes, largest = [norm(row) for row in rows], 0.0
+    if not sizes[-1] < SMALL * max(sizes):
+        return largest
+    for k in range(1, len(times)):
+        kick = KICK * sizes[k] / math.sqrt(rows.shape[1])
+        starts = [jax.tree.map(lambda leaf, k=k, moved=moved: leaf[k] + moved, y) for moved in (0.0, kick)]
+        for unit in (size, sizes[k]):
+            a, b = (flat_rows(run(start, times[k - 1], times[-1:], RTOL[1], unit).y)[-1] for start in starts)
+            if np.isfinite(change := distance(a, b)):
+                largest = max(largest, float(np.finfo(float).eps) * change / KICK)
+                break
+    return largest
+
+
+def is_jump(f: Any, y: Any, numbers: Any, args: Any, times: tuple[float, float]) -> bool:
+    """Whether f at two neighbouring times differs; at y, or at the state of its form with these numbers."""
+    with double_precision():
+        start, unflatten = trees.real_vector(cast(y, float))
+        state, args = unflatten(start if numbers is None else jnp.asarray(numbers)), cast(args, float)
+        a, b = (flat(f(jnp.asarray(t, float), state, args)) for t in times)
+        return bool(distance(a, b) > JUMP * max(norm(a), norm(b)))

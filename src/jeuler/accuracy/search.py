@@ -11,10 +11,11 @@ import numpy as np
 
 from jeuler._core import trees
 from jeuler._core.precision import double_precision, flat
-from jeuler.accuracy.known_end import Reference, find_reference
+from jeuler.accuracy.known_end import Reference, find_reference, is_jump
 from jeuler.accuracy.leading import LARGEST_ORDER, LeadingError
 from jeuler.accuracy.pilot import Ladder, Pilot, distance, norm
 from jeuler.accuracy.roundoff import Rounding
+from jeuler.solving._breaks import SIDE
 from jeuler.steps.explicit import Step, VectorField
 from jeuler.steps.implicit import linearly_implicit_euler_step
 from jeuler.steps.stability import Linearisation
@@ -39,6 +40,7 @@ BETWEEN = 20, 400  # numbers of steps at least and at most, where the error of a
 NEAR_ENOUGH = 4  # an answer of up to this part of the longest pilot run is run itself, not predicted
 DOUBLINGS = 64  # times the steps that stability asks for, to see how the error falls from there on
 ROUGH = 2**18  # steps of the longest run in float32
+ROUGHEST = 1e-30  # an end below this sinks under the numbers of float32, whose runs then say nothing of roundoff
 FOLLOWS = 0.05  # part of an error by which the end of a run may miss that of the modified equation
 TINY = 1e-290  # a final state below this has no scale of its own
 
@@ -59,6 +61,7 @@ class Search:
     ceiling: int  # of one where stability asks for so many
     breaks: tuple[float, ...]
     disagreeing: bool  # whether adaptive runs came to different ends
+    vanishing: bool  # whether the end is 0 but for roundoff, so that no error is relative to it
     interval: float
     order: int
     dtype: Any
@@ -86,7 +89,7 @@ class Search:
         self.f, self.start, self.t0, self.t1, self.args, self.step = f, y0, t0, t1, args, step
         self.error, self.relative, self.compensated = error, relative, compensated
         self.planned, self.ceiling = most, max(most, ceiling)
-        self.breaks, self.disagreeing = breaks, False
+        self.breaks, self.disagreeing, self.vanishing = breaks, False, False
         self.interval = t1 - t0
         self.order = int(getattr(step, "order", 1))
         self.dtype = np.dtype(trees.time_dtype(y0))
@@ -97,8 +100,14 @@ class Search:
         self.bound = math.inf  # largest dt whose instability, if any, stays small until t1
         self.look_at_stability(flat(y0)[None], np.array([t0]))
 
-    def runs(self, step: Step, dtype: Any, compensated: bool) -> Pilot:
-        return Pilot(self.f, self.start, self.t0, self.t1, self.args, step, dtype, compensated, self.breaks)
+    def runs(self, step: Step, dtype: Any, compensated: bool, breaks: tuple[float, ...] | None = None) -> Pilot:
+        breaks = self.breaks if breaks is None else breaks
+        return Pilot(self.f, self.start, self.t0, self.t1, self.args, step, dtype, compensated, breaks)
+
+    def jumps_at(self, end: float, inside: int, final: Any) -> bool:
+        """Whether f at an end of the interval is not what it is just inside: after it for +1, before it for -1."""
+        beside = end + inside * SIDE * float(np.finfo(float).eps) * max(abs(self.t0), abs(self.t1))
+        return is_jump(self.f, self.start, None if inside > 0 else final, self.args, (end, beside))
 
     @property
     def most(self) -> int:
@@ -110,7 +119,7 @@ class Search:
     def scale(self, final: Any) -> float:
         """The unit of the target, in the units of the state."""
         size = norm(final)
-        return size if self.relative and not size < TINY else 1.0
+        return size if self.relative and not self.vanishing and not size < TINY else 1.0
 
     def target(self, ladder: Ladder) -> float:
         """The target in the units of the state."""
@@ -256,7 +265,9 @@ class Search:
         """An adaptive run that is known well enough to judge the target."""
         tolerance, most = TRUST * self.error, max(256, self.planned // 8)
         problem = self.f, self.start, self.t0, self.t1, self.args, self.breaks
-        known, self.disagreeing = find_reference(problem, most, lambda end: tolerance * self.scale(end))
+        scale = lambda end: 1.0 if end is None else self.scale(end)  # noqa: E731
+        known, self.disagreeing = find_reference(problem, most, lambda end: tolerance * scale(end))
+        self.vanishing = known is not None and known.vanishes
         return known
 
     def by_leading_term(self, known: Reference) -> tuple[int, float, int] | None:
@@ -340,9 +351,13 @@ class Search:
 
     def implicit_steps(self, final: np.ndarray, fewer_than: int) -> int | None:
         """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that few."""
-        run, aim = self.runs(linearly_implicit_euler_step, np.float64, False), AIM * self.error * self.scale(final)
+        return self.steps_of(linearly_implicit_euler_step, final, min(fewer_than, self.planned // 64))
+
+    def steps_of(self, step: Step, final: np.ndarray, fewer_than: int, dtype: Any = np.float64) -> int | None:
+        """How many of these steps meet the aim, a power of two, found by runs; None if not so few."""
+        run, aim = self.runs(step, dtype, False), AIM * self.error * self.scale(final)
         num_steps, met = 1, False
-        while num_steps < min(fewer_than, self.planned // 64):
+        while num_steps < fewer_than:
             before, met = met, distance(run(num_steps)[-1], final) <= aim
             if before and met:  # twice running: no accident
                 return num_steps // 2
@@ -356,6 +371,8 @@ class Search:
         its error is least, for one in float64 (out of reach) carried over by the ratio of the two eps.
         """
         rough, scale = self.runs(self.step, np.float32, self.compensated), self.scale(ladder.best)
+        if self.dtype == np.float64 and scale < ROUGHEST:
+            return Rounding(float(np.finfo(float).eps), 0.5)
         carried = float(np.finfo(self.dtype).eps / np.finfo(np.float32).eps) / scale
         known = dict(zip(ladder.num_steps, ladder.finals, strict=True))
 
