@@ -187,6 +187,21 @@ def test_fast_thin_crossing_is_not_missed_within_a_step(collider, end):
     np.testing.assert_allclose(jnp.linalg.norm(run.velocity[-1]), 100, rtol=1e-12)
 
 
+def test_ball_that_only_begins_to_fall_close_above_the_floor_is_not_missed():
+    """Gaps of 1e-9 to 1e-3 m and speeds around 0, 40 mm a step of falling: the way to the impact begins almost flat."""
+    scene = jeuler.Scene((jeuler.Gravity([0.0, -10.0]),), (Collisions((FLOOR,), radius=0.1, restitution=0.5),))
+
+    def height(gap, up):
+        state = ball(jnp.stack([0 * gap, 0.1 + gap]), jnp.stack([0 * up, up]))
+        end = jeuler.simulate(scene, state, dt=0.02, num_steps=1, step=jeuler.rk4_step)
+        return end.y.position[-1, 0, 1] - 0.1, end.unresolved_contacts
+
+    gap, up = np.meshgrid(np.logspace(-9, -3, 61), np.linspace(-0.02, 0.09, 111))
+    end, unresolved = jax.jit(jax.vmap(height))(gap.ravel(), up.ravel())
+    assert (end > -1e-9).all()
+    assert not unresolved.any()
+
+
 def test_inside_of_a_sphere_holds():
     scene = jeuler.Scene(effects=(Collisions((Sphere([0.0, 0.0], 1.0, inside=True),), restitution=1.0),))
     run = jeuler.simulate(scene, ball([0.3, 0.1], [2.0, 1.7]), dt=0.1, num_steps=200).y

@@ -4,7 +4,7 @@ import contact_scenes
 import numpy as np
 import pytest
 
-SCENES = 8  # drawn, beside those that were wrong once
+SCENES = 7  # drawn, beside those that were wrong once
 
 
 def scene(
@@ -42,7 +42,10 @@ TIED = [  # two impacts at one time, whose order decides what happens: counted, 
         friction=0.3, dt=1 / 30,
     ),  # a ball falls into a corner
 ]  # fmt: skip
-GAINED = scene([(0.1, 0.1), (0.1, 0.3)], [(-0.5, 0.0), (0.5, 0.0)], restitution=0.5, dt=0.01)  # one slides over another
+GAINED = [  # one slides over another that stands on the floor
+    scene([(0.1, 0.1), (0.1, 0.3)], [(-0.5, 0.0), (0.5, 0.0)], restitution=0.5, dt=0.01),
+    scene([(0.1, 0.1), (0.1, 0.3)], [(-0.5, 0.0), (-1.0, 0.0)], gravity=-10.0, dt=1 / 60),
+]
 GLIDE = scene(  # two that touch each other and a slope, without a load: each change of a place has one contact or the other
     [(0.236, 0.302), (0.396, 0.422)], [(0.8, 0.6), (0.8, 0.6)], gravity=0.0, restitution=0.0, dt=0.01
 ) | {"normals": np.array([(-0.6, 0.8), (1.0, 0.0)])}  # fmt: skip
@@ -54,7 +57,7 @@ def test_gradients_of_two_balls_a_floor_and_a_wall(method):
     shape = "two balls, floor and wall"
     random = np.random.default_rng(3)
     _, everything, _ = contact_scenes.programs(shape, STEPS, few=True)
-    scenes = [*TIED, GAINED, GLIDE, *WRONG_ONCE, *(contact_scenes.draw(random, shape) for _ in range(SCENES))]
+    scenes = [*TIED, GLIDE, *GAINED, *WRONG_ONCE, *(contact_scenes.draw(random, shape) for _ in range(SCENES))]
     numbers = contact_scenes.batch(scenes, np.float64)
     points = len(scenes) * 33  # each scene, and four changes of each of its 8 numbers: one batch, one program
 
@@ -67,8 +70,6 @@ def test_gradients_of_two_balls_a_floor_and_a_wall(method):
     wrong = contact_scenes.wrong_gradients(gradient, slopes)
     assert not wrong[unresolved == 0].any()
     assert unresolved[0] > 0
-    assert not contact_scenes.agree(slopes)[2, 0, 0, 1]
+    assert not contact_scenes.agree(slopes)[1, 0, 0, 1]
     rise, allowed = contact_scenes.rise_of_energy(numbers, position, velocity, STEPS[method])
-    gained = np.flatnonzero((rise > allowed) & (unresolved == 0))
-    known = [len(TIED)] if STEPS[method] in ("Heun", "RK4") else []  # as docs/hard_cases.md says
-    assert gained.tolist() == known
+    assert not ((rise > allowed) & (unresolved == 0)).any()

@@ -205,6 +205,12 @@ class Contacts:
             total = total.at[self.i].add(first[self.walls :]).at[self.j].add(-second[self.walls :])
         return total
 
+    def of_colliders(self, change: Array) -> Array:
+        """What each collider adds to each particle, (collider, particle, dim); none where there are no others."""
+        walls = 0 if self.alone else self.walls
+        own = change[:walls].reshape(-1, self.particles, self.dim)
+        return jnp.where((self.inverse_mass > 0)[:, None], own, 0)
+
     def move(self, change: Array) -> Array:
         """The changes (particle, ...) by impulses that change the relative velocity by (contact, ...) if alone."""
         movable = self.inverse_mass > 0

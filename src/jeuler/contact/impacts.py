@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jeuler._core.vectors import length
+from jeuler._core.vectors import length, unit
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import TOUCH, Contacts, Look
 from jeuler.contact.paths import Path, along
 
 MAX_STRIDES = 400  # along one path; one that grazes a surface that is not known to be convex needs many
-NEWTON_STEPS = 12
+NEWTON_STEPS = 32  # where the approach begins at 0 each only halves the way to the root
 GRAZING = 4  # square roots of a unit in the last place: an approach in parts of the speed that rounding can make or end
 
 
@@ -123,7 +123,8 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
         not_too_slow = jnp.where(slope >= 0, jnp.minimum(0.02, longer), 0)  # away from a surface of any form
         ahead = jnp.minimum(jnp.maximum(gap / safe_stride, jnp.where(convex, longer, not_too_slow)), 2)
         falls = slope < 0
-        root = jnp.clip(s - gap / jnp.where(falls, slope, -1), lowest, 2)
+        latest = jnp.where(s < 1, 1, 2)  # where the gap only begins to fall, Newton's step goes too far
+        root = jnp.clip(s - gap / jnp.where(falls, slope, -1), lowest, latest)
         s = jnp.where(n == 0, s, jnp.where(far, s + ahead, jnp.where(falls, root, s)))
         newtons = newtons + jnp.where((n > 0) & ~far, 1, 0)
         look = contacts.look(path, s)
@@ -136,7 +137,9 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     s, look, apart, newtons, _ = lax.while_loop(go_on, advance, state)
     given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
     at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small - 1e-6 * look.slope) & (s > lowest)
-    happens = searched & (now | (apart & at_root & (s <= 1)))
+    given_up = given_up | (searched & apart & ~at_root & (s <= 1) & (look.gap < -small))
+    by_rest = rests & (s - 2 * small / jnp.where(at_root, look.slope, -1) >= 1)  # the gap that its solve has closed
+    happens = searched & (now | (apart & at_root & (s <= 1) & ~by_rest))
     overlap = now & ~at_root
     look = jax.tree.map(lambda x, y: jnp.where(overlap if x.ndim == 1 else overlap[:, None], x, y), first, look)
     s = jnp.where(overlap, start, s)
@@ -209,7 +212,10 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     hit = (events.contact >= 0)[:, None]
     late = (1 - own_s)[:, None] + 0.5 - theta
     speed = jnp.where(hit, path.speed(own_s) + contacts.dt * kick, path.way)
-    hold = hold - jnp.where(hit & leaves_its_support(path, own_s, speed), path.support, 0)
+    off = hit & leaves_its_support(path, own_s, speed)
+    hold = hold - jnp.where(off, path.support, 0)
+    support = path.support + hold
+    new = jnp.abs(along(hold, support)) > 1e-6 * (length(path.bend) + length(path.support))
     return Path(
         own_s,
         jnp.where(hit, path.position(own_s), path.x),
@@ -217,26 +223,40 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
         path.bend + hold,
         path.jump + kick + late * hold / contacts.dt,
         path.hit | hit[:, 0],
-        path.support + hold,
-        jnp.where(jnp.any(hold != 0, axis=-1), along(speed, path.support + hold), path.ride),
+        support,
+        jnp.where(new, along(speed, support), path.ride),
+        jnp.where(off, 0, path.ground) + contacts.of_colliders(jnp.where(now[:, None], held, zero)),
     )
 
 
 def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Array:
-    """What of a change of the relative bend, (contact, dim), falls to each particle, (particle, dim).
+    """What of a change of the relative bend along the normal, (contact, dim), falls to each particle, (particle, dim).
 
-    By the masses; who would be pushed against what holds it is held, and the other partner takes all.
+    By the masses; who is pushed against colliders that hold it moves along these, which take the rest of the push. Who
+    is pushed against balls that hold it, and no collider, stays, and the other partner takes all.
     """
+    if contacts.alone:
+        return contacts.gather(change, change)
+    least = 1e-6 * (length(path.bend) + length(path.support))  # of a push; what is less is left by iterations
+    colliders = [unit(jnp.where((length(ground) > least)[:, None], ground, 0)) for ground in path.ground]
+    on_balls = length(path.support) > least
+    for upward in colliders:
+        on_balls = on_balls & jnp.all(upward == 0, axis=-1)
 
-    def free(support, towards):
-        return jnp.sum(support * towards, axis=-1) >= -0.5 * length(support)
+    def response(of, towards):
+        """What a push of 1 along ``towards`` does to a particle, (contact, dim)."""
+        push = towards
+        for upward in [of(up) for up in (*colliders, *colliders[:-1])]:
+            push = push - jnp.minimum(jnp.sum(upward * push, axis=-1, keepdims=True), 0) * upward
+        support = of(path.support)
+        stays = of(on_balls) & (jnp.sum(support * towards, axis=-1) < -0.5 * length(support))
+        return jnp.where(stays[:, None], 0, push * of(contacts.inverse_mass)[:, None])
 
-    first, second = contacts.first(contacts.inverse_mass), contacts.second(contacts.inverse_mass)
-    first = jnp.where(free(contacts.first(path.support), normal), first, 0)
-    second = jnp.where(free(contacts.second(path.support), -normal), second, 0)
-    both = first + second
-    change = change * jnp.where(both > 0, 1 / jnp.where(both > 0, both, 1), 0)[:, None]
-    return contacts.gather(first[:, None] * change, second[:, None] * change)
+    first, second = response(contacts.first, normal), response(contacts.second, -normal)
+    both = jnp.sum((first - second) * normal, axis=-1, keepdims=True)
+    moves = both > 1e-6 * contacts.both(jnp.add, contacts.inverse_mass)[:, None]
+    push = jnp.sum(change * normal, axis=-1, keepdims=True) * jnp.where(moves, 1 / jnp.where(moves, both, 1), 0)
+    return contacts.gather(push * first, -push * second)
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:

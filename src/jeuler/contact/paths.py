@@ -33,6 +33,7 @@ class Path(NamedTuple):
     hit: Array  # (particle,), whether there was an impact
     support: Array  # (particle, dim), what of bend are forces of contacts that it stays in, m
     ride: Array  # (particle,), dx/ds along the support while it stays, m a step
+    ground: Array  # (collider, particle, dim), how each collider pushes against bend, m; none where it has one contact
 
     def position(self, s: Array) -> Array:
         part = (s - self.s)[:, None]
@@ -43,11 +44,13 @@ class Path(NamedTuple):
         return self.way + (s - self.s)[:, None] * self.bend
 
 
-def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = 0.0) -> Path:
-    """The path of a step without impacts; ``kick`` is what of dv contacts give that last through the step."""
+def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = 0.0, ground: Any = None) -> Path:
+    """The path of a step without impacts; ``kick`` is what of dv contacts give that last through the step, and
+    ``ground`` what each collider gives to push against, (collider, particle, dim), m/s."""
     zero, bend, support = jnp.zeros(len(x), x.dtype), dt * dv, jnp.zeros_like(x) + dt * kick
+    ground = jnp.zeros((0, *x.shape), x.dtype) if ground is None else dt * ground
     way = displacement - bend / 2
-    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, along(way + bend, support))
+    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, along(way + bend, support), ground)
 
 
 def along(y: Array, support: Array) -> Array:

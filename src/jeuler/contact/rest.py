@@ -42,6 +42,7 @@ class Rest(NamedTuple):
     """What the contacts at rest do in a step."""
 
     kick: Array  # (particle, dim), what they add to the velocity, m/s
+    push: Array  # (contact, dim), what each would add to the relative velocity of its partners if it were alone, m/s
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -157,7 +158,8 @@ def at_rest(problem: Problem, small: Array, load: Array | None = None) -> Rest:
     without = jnp.sum(problem.close()) - jnp.sum(own.close())
     on = jnp.zeros(len(small), bool).at[kept].set(rest.on, mode="drop")
     gap = jnp.zeros_like(small).at[kept].set(rest.gap, mode="drop")
-    return rest._replace(on=on, gap=gap, unresolved=rest.unresolved + without.astype(jnp.int32))
+    push = jnp.zeros_like(problem.normal).at[kept].set(rest.push, mode="drop")
+    return rest._replace(push=push, on=on, gap=gap, unresolved=rest.unresolved + without.astype(jnp.int32))
 
 
 def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
@@ -193,7 +195,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)
     left = jnp.where(active, contacts.dt * left, 0)
-    return Rest(contacts.move(w), contacts.dt * shift, on, left, unresolved)
+    return Rest(contacts.move(w), w, contacts.dt * shift, on, left, unresolved)
 
 
 def pressing(problem: Problem, small: Array) -> Array:

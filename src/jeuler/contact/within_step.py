@@ -145,7 +145,8 @@ def hold(
     touched = _touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1)
     contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
-    path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.kick)
+    ground = contacts.of_colliders(jnp.sum(rest.push * normal, axis=-1, keepdims=True) * normal)
+    path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.kick, ground)
     lost = _touched(contacts, jnp.isnan(gap) & (jnp.arange(contacts.count) < contacts.walls)) & contacts.alive
     return path, v + dv + rest.kick, touched, unresolved, lost
 
