@@ -115,8 +115,16 @@ def test_a_file_of_another_fit_is_refused(tmp_path, stopped):
     descended = tmp_path / "descended"
     with pytest.raises(Killed):
         stopped(FITS["adam"], descended, 1, Killed)
-    with pytest.raises(ValueError, match="holds another fit"):
-        one(optimizer=optax.sgd(0.1), max_iterations=12, stages=[FIRST])(resume=descended)
+    adam = {"optimizer": optax.adam(0.1), "max_iterations": 12, "stages": [FIRST]}
+    for other in (
+        adam | {"optimizer": optax.sgd(0.1)},
+        adam | {"optimizer": optax.adam(0.2)},
+        adam | {"optimizer": optax.adam(optax.piecewise_constant_schedule(0.1, {10: 0.5}))},
+        adam | {"scale": {"a": 2.0, "k": 1.0}},
+        adam | {"residual": lambda p, y: 2 * decay(p, y)},
+    ):
+        with pytest.raises(ValueError, match="holds another fit"):
+            one(**other)(resume=descended)
     for words in ("no file of ours", ""):
         path.write_text(words)
         if words:

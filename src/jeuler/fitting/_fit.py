@@ -75,7 +75,9 @@ def fit(
         by which the loss must decrease within 50 iterations.
       stages: weights of the residual (its structure; 0 leaves out) that are fitted one after the other before all of
         it is: a growing time horizon keeps an oscillation's fit out of wrong periods.
-      resume: path of a file in which the search writes where it is, and from which it goes on if it is there.
+      resume: path of a file in which the search writes where it is, and from which it goes on if it is there. The file
+        knows its fit by data, start, options, and by the code and the values of residual and optimizer: a fit of
+        another residual or another learning rate is refused.
       progress: show a progress bar; None shows it on a terminal.
     Returns: `Fit`. After Ctrl-C the best so far.
     Raises: ValueError, if an argument does not fit the others, the residual is empty, or it is not finite at the start.

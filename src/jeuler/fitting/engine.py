@@ -47,7 +47,7 @@ def run(problem: Problem, options: Options, *, scale: PyTree = None, known: Know
         from jeuler.fitting.matrix_free import run_matrix_free
 
         return Outcome(*run_matrix_free(problem, options, evaluate, known))
-    record = Record.of(options.resume, *marks(problem, options, task))
+    record = Record.of(options.resume, lambda: (marks(problem, options, task), scale))
     starts = None
     with progress_bar(options.progress, options.max_iterations * (len(problem.stages) + 1)) as bar:
         watch = Watch(bar, record)

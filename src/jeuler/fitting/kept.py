@@ -7,6 +7,7 @@ import hashlib
 import os
 import time
 import zipfile
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,7 +25,7 @@ class Record:
 
     Attributes:
       path: of the file.
-      mark: of the problem: its form, its start and its data.
+      mark: of the problem: its residual, its form, its start and its data, and how it is searched.
       found: what the file held when the fit began; None where there was none.
       ends: where the searches from many starts ended, (start, n), and the cost of each, as far as they are there.
       pause: least time between two writes, s; it grows so that writing takes less than a twentieth of the time.
@@ -38,13 +39,13 @@ class Record:
     last: float = -np.inf
 
     @classmethod
-    def of(cls, path: Any, *problem: Any) -> Record | None:
+    def of(cls, path: Any, problem: Callable[[], Any]) -> Record | None:
         """A record at this path for a problem made of arrays and of what prints itself; None without a path."""
         if path is None:
             return None
         check_output(path)
         digest = hashlib.sha256()
-        for leaf in jax.tree.leaves(problem):
+        for leaf in jax.tree.leaves(problem()):
             digest.update(np.asarray(_numbers(leaf)).tobytes() if hasattr(leaf, "dtype") else repr(leaf).encode())
         record = cls(os.fspath(path), digest.hexdigest())
         record.found = record._opened()
@@ -90,8 +91,8 @@ class Record:
     @property
     def _of_another(self) -> str:
         return (
-            f"resume={self.path!r} holds another fit (other data, start, parameters or options); "
-            f"give another path, or delete the file"
+            f"resume={self.path!r} holds another fit (another residual or optimizer, other data, start, parameters or "
+            f"options); give another path, or delete the file"
         )
 
     def _opened(self) -> dict[str, np.ndarray] | None:

@@ -15,6 +15,7 @@ from jax import Array
 
 from jeuler._core import checks
 from jeuler._core.partition import OfArrays, arrays_only
+from jeuler._jax.fingerprint import fingerprint
 from jeuler._jax.programs import is_transformed
 from jeuler.fitting.evaluate import Evaluate, evaluations
 from jeuler.fitting.least_squares import Task
@@ -222,10 +223,11 @@ class Problem:
 
 
 def marks(problem: Problem, options: Options, task: Task) -> tuple[Any, ...]:
-    """By what a file knows that it is of this fit."""
+    """By what a file knows that it is of this fit: arrays and what prints itself."""
     windows = () if problem.windows is None else problem.windows.data
     how = (options.loss, options.loss_scale, options.starts, options.minibatch, options.max_iterations)
-    return task, problem.stages, np.asarray(problem.x), repr(problem.layout.shapes), how, windows
+    functions = fingerprint((problem.residual, options.optimizer))
+    return task, problem.stages, np.asarray(problem.x), repr(problem.layout.shapes), how, windows, functions
 
 
 def variance_of_noise(problem: Problem, task: Task, state: Any) -> float:
