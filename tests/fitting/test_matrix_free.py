@@ -2,6 +2,7 @@
 
 import copy
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from jeuler.fitting import matrix_free, minimise
 from jeuler.fitting import problem as problems
 from jeuler.fitting import report as reports
 from jeuler.fitting.matrix_free import conjugate_gradients
+from jeuler.fitting.nearby import from_nearby
 
 T = np.linspace(0, 4, 60)
 TRUTH = {"a": np.linspace(1, 3, 6), "k": np.linspace(0.2, 1.2, 6)}
@@ -119,11 +121,13 @@ def test_springs_and_the_bias_of_the_step_are_those_of_the_fit_that_forms_a_jaco
 def test_conjugate_gradients_solve_and_say_what_is_left(random):
     root = random.normal(size=(40, 12))
     matrix, b = root.T @ root, random.normal(size=12)
-    s, left = conjugate_gradients(lambda s: matrix @ s, jnp.asarray(b))
+    s, left, more = conjugate_gradients(lambda s: matrix @ s, jnp.asarray(b), 0.05, lambda total: 0.0)
     best = np.linalg.solve(matrix, b)
     np.testing.assert_allclose(left, b - matrix @ s, atol=1e-12)
     assert b @ best * 0.95 < 2 * b @ s - s @ matrix @ s <= b @ best + 1e-12
-    s, _ = conjugate_gradients(lambda s: 0 * s, jnp.asarray(b))
+    assert 0 <= more <= 0.05 * b @ best
+    s, _, more = conjugate_gradients(lambda s: 0 * s, jnp.asarray(b), 0.05, lambda total: 0.0)
+    assert more == 0
     np.testing.assert_array_equal(s, 0)  # nothing is seen: nothing moves
 
 
@@ -215,3 +219,27 @@ def test_what_is_asked_for_in_vain_is_said(without_a_jacobian):
     without_a_jacobian()
     with pytest.raises(ValueError, match="fit again"):
         copy.copy(jeuler.fit(residual, {"a": np.ones(6), "k": np.ones(6)}, data=data())).standard_error("a[0]")
+
+
+@pytest.mark.parametrize(("start", "less", "near"), [(1.02, None, True), (1.02, 0.01, True), (2.0, None, False)])
+def test_one_jacobian_leads_to_a_minimum_that_is_near(start, less, near):
+    """Between bounds too; from further away it says so, and the search that forms none begins."""
+    y, bounds, x = data(), None, jax.tree.map(lambda p: start * p, TRUTH)
+    if less is not None:
+        bounds = {"a": (0.0, TRUTH["a"] - less)}
+        x["a"] = 0.98 * TRUTH["a"]
+    best = jeuler.fit(residual, x, data=y, bounds=bounds, progress=False)
+    problem = problems.Problem.of(residual, x, data=y, bounds=bounds)
+    evaluate, history = problems.programs(problem.residual, problem.data), []
+    with minimise.progress_bar(False, 1) as bar:
+        found = from_nearby(
+            evaluate, np.asarray(problem.x, float), problem.task(1e-4), 200, history, minimise.Watch(bar)
+        )
+    assert (found is not None) == near
+    if near:
+        off = np.abs(found.x - problem.layout.vector(best.params))
+        assert np.max(off - 0.05 * problem.layout.vector(best.stderr)) <= 0
+        np.testing.assert_allclose(found.total, len(y.ravel()) * best.loss, rtol=1e-3)
+        assert found.total == history[-1]
+        assert np.sum(found.x >= problem.upper) == len(best.at_bound)
+        assert (len(best.at_bound) > 2) == (less is not None)

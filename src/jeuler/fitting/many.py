@@ -126,11 +126,11 @@ def autocovariances_by_signs(
         found[some] = np.concatenate(moved) * counted[some, None]
         return found
 
-    left = left_over(signs)
+    moved = [shifted(signs, h) for h in range(lags + 1)]
+    left, *lefts = np.split(left_over(np.concatenate([signs, *moved], axis=1)), lags + 2, axis=1)
     rows, seen = [], []
-    for h in range(lags + 1):
+    for h, mine in enumerate(lefts):
         half = 0.5 if h else 1.0
-        mine = left_over(shifted(signs, h))
         rows.append([half * float(np.sum(mine * shifted(left, j))) / probes for j in range(lags + 1)])
         whole = np.zeros((m, 1))
         whole[some] = kept

@@ -33,6 +33,7 @@ from jeuler.fitting.least_squares import (
 from jeuler.fitting.losses import LOSSES
 from jeuler.fitting.many import MOST_BYTES, MOST_ERRORS, weighted_jacobian
 from jeuler.fitting.minimise import TUNING, Watch, progress_bar
+from jeuler.fitting.nearby import from_nearby
 from jeuler.fitting.options import Known, Options
 from jeuler.fitting.problem import FlatResidual, Problem, marks, variance_of_noise
 from jeuler.fitting.profiles import AGAIN, Again, Ended
@@ -43,8 +44,11 @@ from jeuler.fitting.starts import best_of, starts_of
 
 PROBES = 8  # random directions that estimate the norms of the columns
 MOST_PRODUCTS = 300  # iterations of conjugate gradients in one step
-ACCURACY = 0.05  # of the decrease that a step makes, relative
-NEAR = 0.05  # standard errors, root mean square over the unknowns: such a step is the last
+ACCURACY = 0.05  # of the decrease that a step makes, relative,
+ACCURATE = 1e-4  # and where the linear model was right about the step before
+RIGHT = 0.1  # of the predicted decrease: it was right if it kept to that
+NEAR = 0.05  # standard errors, root mean square over the unknowns: how far from the minimum a search may end
+FEWEST = 40  # iterations of conjugate gradients after which their estimate of what is left is believed
 NEARER = 0.02  # of the variance of the noise: what a search for a profile may still have to gain before its last step
 MOST_STEPS = 100  # of such a search
 
@@ -61,6 +65,7 @@ class Point(NamedTuple):
     iterations: np.ndarray
     nonfinite: np.ndarray
     status: np.ndarray
+    right: np.ndarray  # whether the linear model was right about the last step
 
 
 class Products(NamedTuple):
@@ -85,7 +90,7 @@ def products(residual: FlatResidual, loss: str) -> Products:
         return jnp.sum(rho(r / task.spread)[0]) * task.spread**2, jnp.sum(everything**2), r
 
     @jax.jit
-    def step(x: Array, task: Task, damping: Array) -> tuple[Array, Array]:
+    def step(x: Array, task: Task, damping: Array, accuracy: Array, share: Array) -> tuple[Array, Array, Array]:
         r, forwards = jax.linearize(lambda x: weighted(x, task), x)
         backwards = jax.linear_transpose(forwards, x)
         slope = rho(r / task.spread)[1]
@@ -100,28 +105,32 @@ def products(residual: FlatResidual, loss: str) -> Products:
         def normal(s: Array) -> Array:
             return unit * backwards(slope**2 * forwards(unit * s))[0] + damping * s
 
-        s, left = conjugate_gradients(normal, -unit * gradient)
+        size = jnp.sum(rho(r / task.spread)[0]) * task.spread**2
+        s, left, more = conjugate_gradients(normal, -unit * gradient, accuracy, lambda total: share * (size - total))
         decrease = jnp.sum(s * (left - unit * gradient)) + damping * jnp.sum(s**2)
-        return unit * s, decrease
+        return unit * s, decrease, more
 
     return Products(cost, step)
 
 
-def conjugate_gradients(product: Any, b: Array) -> tuple[Array, Array]:
-    """s with A s = b, nearly, and b - A s: stopped when going on would hardly decrease s^T A s / 2 - b^T s further.
+def conjugate_gradients(product: Any, b: Array, accuracy: Any, enough: Any) -> tuple[Array, Array, Array]:
+    """s with A s = b, nearly, b - A s, and an estimate of how far s^T A s - 2 b^T s would still fall.
 
-        n (Q_n - Q_(n-1)) < accuracy Q_n
+        n (Q_n - Q_(n-1)) < accuracy Q_n,   or less than is enough, after a few iterations
 
     Args:
       product: s -> A s, symmetric and positive semidefinite.
       b: (n,).
+      accuracy: of the decrease, relative.
+      enough: decrease so far -> what may be left of it.
     Source: S. G. Nash, A. Sofer, Assessing a search direction within a truncated-Newton method, Operations Research
       Letters 9, 1990 (when to stop).
     """
 
     def goes_on(carry: Any) -> Any:
         _, _, _, square, gained, total, n = carry
-        return (n < MOST_PRODUCTS) & (square > 0) & (n * gained >= ACCURACY * total)
+        little = (n * gained < accuracy * total) | ((n >= FEWEST) & (n * gained < enough(total)))
+        return (n < MOST_PRODUCTS) & (square > 0) & ((n == 0) | ~little)
 
     def turn(carry: Any) -> Any:
         s, left, direction, square, _, total, n = carry
@@ -134,8 +143,9 @@ def conjugate_gradients(product: Any, b: Array) -> tuple[Array, Array]:
         return s, left, left + new / square * direction, new, gained, total + gained, n + 1
 
     zero = jnp.zeros((), b.dtype)
-    s, left, *_ = lax.while_loop(goes_on, turn, (jnp.zeros_like(b), b, b, jnp.sum(b**2), zero, zero, 0))
-    return s, left
+    begun = jnp.zeros_like(b), b, b, jnp.sum(b**2), zero, zero, 0
+    s, left, _, square, gained, _, n = lax.while_loop(goes_on, turn, begun)
+    return s, left, jnp.where(square > 0, n * gained, 0)
 
 
 def run_matrix_free(
@@ -143,32 +153,37 @@ def run_matrix_free(
 ) -> tuple[Fit, State | None, bool]:
     """The fit of a problem whose Jacobian the search does not form, where it ended, and whether the user stopped it.
 
-    The Jacobian is formed once at the end, for the errors, where it is not too large; else the state is None.
+    The Jacobian is formed once for the errors, where it is not too large: at the end, or at the start where that is
+    near enough for it to lead to the minimum; else the state is None.
     """
     task = problem.task(options.tolerance)
     spread = options.loss_scale if options.loss_scale is not None else TUNING * (known.noise or 1.0)
     task = task._replace(spread=np.asarray(spread if options.loss != "linear" else 1.0))
-    own, x = products(problem.residual, options.loss), np.asarray(problem.x, float)
-    record = Record.of(options.resume, *marks(problem, options, task))
+    own, x, m = products(problem.residual, options.loss), np.asarray(problem.x, float), problem.form.size
+    record = Record.of(options.resume, lambda: marks(problem, options, task))
     with progress_bar(options.progress, options.max_iterations) as bar:
         watch, starts, stages = Watch(bar, record), None, problem.stages
         if options.starts is not None:
             x, starts = best_of(problem, *_ends(own, problem, options, task, watch))
             stages = ()
-        kept = None if record is None else record.load(beginning(x, problem.form.size))
-        first, point, history = (0, beginning(x, problem.form.size), []) if kept is None else kept
-        for stage, mask in enumerate((*stages, task.all_weights)):
-            if stage < first or (watch.interrupted and stage < len(stages)):
-                continue
-            if stage > first or kept is None:
-                point = beginning(point.x, problem.form.size, point.nonfinite)
-            point = descend(own, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
-    if not np.isfinite(point.total):
+        kept = None if record is None else record.load(beginning(x, m))
+        first, point, history = (0, beginning(x, m), []) if kept is None else kept
+        formed = None
+        if known.near and kept is None and options.loss == "linear" and not stages and _is_formed(problem):
+            formed = from_nearby(evaluate, x, task, options.max_iterations, history, watch)
+        if formed is None:
+            for stage, mask in enumerate((*stages, task.all_weights)):
+                if stage < first or (watch.interrupted and stage < len(stages)):
+                    continue
+                if stage > first or kept is None:
+                    point = beginning(point.x, m, point.nonfinite)
+                point = descend(own, point, task._replace(weights=mask), options.max_iterations, stage, history, watch)
+    if formed is None and not np.isfinite(point.total):
         raise ValueError(WITHOUT_A_START)
-    state, words = start(point.x, 0, 1), ending(point, watch)
-    state = state._replace(**{name: getattr(point, name) for name in ("total", "residual", "nonfinite", "status")})
+    words, state = ending(formed or point, watch), formed or _state_of(point)
     bend = float(task.spread)
-    if (formed := _with_jacobian(problem, evaluate, state, task, options.loss)) is not None:
+    formed = formed or _with_jacobian(problem, evaluate, state, task, options.loss)
+    if formed is not None:
         fit = report(problem, formed, history, bend, options.loss, words, known, starts)
         attach(fit, AGAIN, _again(own, problem, task, fit, formed, None))
         return fit, formed, watch.interrupted
@@ -182,6 +197,12 @@ def run_matrix_free(
         attach(fit, ASKED, asked)
         attach(fit, AGAIN, _again(own, problem, task, fit, state, asked))
     return fit, None, watch.interrupted
+
+
+def _state_of(point: Point) -> State:
+    """A point without a Jacobian as a state, for the report."""
+    names = ("total", "residual", "nonfinite", "status")
+    return start(point.x, 0, 1)._replace(**{name: getattr(point, name) for name in names})
 
 
 def _ends(own: Products, problem: Problem, options: Options, task: Task, watch: Watch) -> tuple[np.ndarray, np.ndarray]:
@@ -231,8 +252,7 @@ def _again(own: Products, problem: Problem, task: Task, fit: Fit, state: State, 
 
 def _with_jacobian(problem: Problem, evaluate: Evaluate, state: State, task: Task, loss: str) -> State | None:
     """The state with its Jacobian; None where that is too large, not finite, or the user stops it."""
-    n, m = len(state.x), problem.form.size
-    if n > MOST_ERRORS or 8 * m * n > MOST_BYTES:
+    if not _is_formed(problem):
         return None
     try:
         jacobian = weighted_jacobian(evaluate, state.x, task.data, np.asarray(task.all_weights, float))
@@ -244,6 +264,12 @@ def _with_jacobian(problem: Problem, evaluate: Evaluate, state: State, task: Tas
     if loss != "linear":
         jacobian *= slope[:, None]
     return state._replace(jacobian=jacobian, scale=column_norms(jacobian))
+
+
+def _is_formed(problem: Problem) -> bool:
+    """Whether the Jacobian is not too large for the errors."""
+    n, m = problem.layout.size, problem.form.size
+    return n <= MOST_ERRORS and 8 * m * n <= MOST_BYTES
 
 
 def beginning(x: np.ndarray, m: int, nonfinite: Any = 0) -> Point:
@@ -259,6 +285,7 @@ def beginning(x: np.ndarray, m: int, nonfinite: Any = 0) -> Point:
         count,
         np.asarray(nonfinite),
         np.asarray(RUNNING),
+        np.asarray(False),
     )
 
 
@@ -282,18 +309,22 @@ def descend(
 
 
 def _iterate(products: Products, point: Point, task: Task, least: float) -> Point:
-    """One damped step, taken or not; the last is where ``least`` standard errors are left."""
+    """One damped step, taken or not; the last is after which ``least`` standard errors are left."""
     x, damping = point.x, point.damping
-    step, decrease = (np.asarray(a, float) for a in products.step(x, task, damping))
     freedom = max(int(np.sum(task.weights > 0)) - len(x), 1)
-    offset = np.sqrt(max(float(decrease), 0.0) / len(x) / (max(float(point.cost - decrease), 1e-300) / freedom))
-    near = damping == 0 and (offset <= least or decrease <= 1e2 * task.precision * point.cost)
+    allowed = least**2 * len(x) / freedom  # of the cost
+    accuracy = np.asarray(ACCURATE if point.right else ACCURACY)
+    found = products.step(x, task, damping, accuracy, np.asarray(allowed))
+    step, decrease, more = (np.asarray(a, float) for a in found)
     trial = np.clip(x + step, task.lower, task.upper)
     cost, total, r = (np.asarray(a, float) for a in products.cost(trial, task))
+    predicted = max(float(point.cost - decrease), 1e-300)
     gain = float(point.cost - cost) / max(float(decrease), 1e-300)
+    solved = more <= allowed * predicted and abs(cost - predicted) <= allowed * predicted
+    near = decrease <= allowed * predicted or decrease <= 1e2 * task.precision * point.cost
     nonfinite = point.nonfinite + (not np.isfinite(cost))
     if np.isfinite(cost) and cost < point.cost and gain > (1e-3 if damping else 0.1):
-        damping = damping * (0.1 if gain > 0.75 else 0.5)
+        damped, damping = damping > 0, damping * (0.1 if gain > 0.75 else 0.5)
         return Point(
             trial,
             cost,
@@ -303,9 +334,11 @@ def _iterate(products: Products, point: Point, task: Task, least: float) -> Poin
             np.asarray(2.0),
             point.iterations + 1,
             nonfinite,
-            np.asarray(CONVERGED if near and gain > 0.5 else RUNNING),
+            np.asarray(CONVERGED if not damped and (near or solved) and gain > 0.5 else RUNNING),
+            np.asarray(not damped and abs(gain - 1) <= RIGHT),
         )
-    flat = near and abs(gain) <= 1  # worse by less than was to be gained: rounding
+    flat = damping == 0 and near and abs(gain) <= 1  # worse by less than was to be gained: rounding
     status = CONVERGED if flat else STALLED if point.growth > 1e12 else RUNNING
     damping = np.asarray(max(damping * point.growth, 1e-3))
-    return point._replace(damping=damping, growth=point.growth * 2, nonfinite=nonfinite, status=np.asarray(status))
+    point = point._replace(damping=damping, growth=point.growth * 2, nonfinite=nonfinite, right=np.asarray(False))
+    return point._replace(status=np.asarray(status))

@@ -56,8 +56,10 @@ class Known:
       variance: sum of squares of the data about their mean, weighted; None where it is not known.
       noise: standard deviation of the noise, weighted; None where it is not known.
       more: further sentences for the message.
+      near: whether the start is likely near the minimum, as where it was found from the data.
     """
 
     variance: float | None = None
     noise: float | None = None
     more: tuple[str, ...] = ()
+    near: bool = False

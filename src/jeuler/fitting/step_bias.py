@@ -13,7 +13,7 @@ from jeuler.fitting.beside import attached
 from jeuler.fitting.factors import projected
 from jeuler.fitting.forward import Forward
 from jeuler.fitting.least_squares import State
-from jeuler.fitting.matrix_free import products
+from jeuler.fitting.matrix_free import ACCURACY, products
 from jeuler.fitting.prediction import compiled_positions, recording
 from jeuler.fitting.problem import variance_of_noise
 from jeuler.fitting.report import INVERSE
@@ -94,7 +94,8 @@ def bias_of_many(task: Recorded, found: Fit, asked: Asked) -> tuple[Any, list[st
     change = np.where(observed, (half - whole) * 2**order / (2**order - 1), 0)
     # measured so that the residual is the change, the step of the search is -J^+ of it: from fitted to exact
     as_if = asked.task._replace(data={**task.data, "targets": np.where(observed, whole - change, 0)})
-    shift, decrease = products(problem.residual, asked.loss).step(asked.state.x, as_if, np.asarray(0.0))
+    step_of, zero = products(problem.residual, asked.loss).step, np.asarray(0.0)
+    shift, decrease, _ = step_of(asked.state.x, as_if, zero, np.asarray(ACCURACY), zero)
     variance = variance_of_noise(problem, asked.task, asked.state)
     share = float(np.sqrt(max(float(decrease), 0.0) / len(asked.state.x) / variance))
     bias = problem.layout.params(-np.asarray(shift, float))

@@ -20,7 +20,8 @@ def from_both(
     if begun is None:
         return run(given, options, scale=scale, known=known), "given"
     try:
-        best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=known)
+        near = dataclasses.replace(known, near=True)
+        best = run(dataclasses.replace(begun, stages=()), options, scale=scale, known=near)
     except ValueError:  # not finite there, as where a sensor's gain is not that of its start
         return run(given, options, scale=scale, known=known), "given"
     if is_good(best.fit) or options.optimizer is not None or best.interrupted:
