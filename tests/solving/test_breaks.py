@@ -1,5 +1,7 @@
 """Fields that jump: what adaptive steps see of them, and times of jumps that are told."""
 
+import functools
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 from advice_problems import GRAVITY, HEIGHT, STIFFNESS, on_the_floor
 
 import jeuler
+from jeuler._jax.haste import jit_in_haste
 from jeuler.steps.embedded import interpolant, tsit5
 
 RATE = 0.7
@@ -17,28 +20,42 @@ def switched(t, y, time):
     return -jnp.where(t <= time, RATE, 0.0) * y
 
 
+def interrupted(t, y, args):
+    """Decay at RATE but for a moment from a time on, of that length, at another rate there."""
+    time, length, there = args
+    return -jnp.where((t > time) & (t <= time + length), there, RATE) * y
+
+
+@functools.cache
+def interrupted_at(step):
+    """Runs to t = 2 that are interrupted at 57 times; what differs between tests is an input of one program."""
+
+    def run(time, length, there, rtol, max_dt):
+        return jeuler.solve_adaptive(
+            interrupted, 1.0, t1=2.0, args=(time, length, there), rtol=rtol, atol=1e-3 * rtol, step=step, max_dt=max_dt
+        )
+
+    return jit_in_haste(jax.vmap(run, in_axes=(0, None, None, None, None)), "some")
+
+
+TIMES, NO_MAX_DT = np.linspace(0.3, 1.7, 57), 10.0
+
+
 @pytest.mark.parametrize("step", [None, jeuler.extrapolated_euler(6), jeuler.extrapolated_euler(3)])
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
-def test_no_switch_is_passed_over(step, rtol):
-    run = jax.jit(
-        jax.vmap(lambda time: jeuler.solve_adaptive(
-            switched, 1.0, t1=2.0, args=time, rtol=rtol, atol=1e-3 * rtol, step=step
-        ))
-    )  # fmt: skip
-    times = np.linspace(0.3, 1.7, 57)
-    got, right = run(times), np.exp(-RATE * times)
-    assert np.all(got.finished)
-    assert np.max(np.abs(got.y[:, -1] / right - 1)) < 100 * rtol
+def test_no_switch_is_passed_over(step):
+    for rtol in (1e-4, 1e-6, 1e-8):
+        got, right = interrupted_at(step)(TIMES, jnp.inf, 0.0, rtol, NO_MAX_DT), np.exp(-RATE * TIMES)
+        assert np.all(got.finished)
+        assert np.max(np.abs(got.y[:, -1] / right - 1)) < 100 * rtol
 
 
 def test_a_moment_of_a_tenth_of_a_second_is_not_passed_over():
     """Two switches, 0.1 s apart, at 57 times: off for that moment, or more."""
     for there, rtol in ((0.0, 1e-6), (0.0, 1e-8), (3.0, 1e-8)):
-        moment = lambda t, y, time, there=there: -jnp.where((t > time) & (t <= time + 0.1), there, RATE) * y  # noqa: E731
-        run = jax.jit(jax.vmap(lambda time: jeuler.solve_adaptive(
-            moment, 1.0, t1=2.0, args=time, rtol=rtol, atol=1e-3 * rtol  # noqa: B023
-        ).y[-1]))  # fmt: skip
-        got, right = run(np.linspace(0.3, 1.7, 57)), np.exp(-1.9 * RATE - 0.1 * there)
+        got, right = (
+            interrupted_at(None)(TIMES, 0.1, there, rtol, NO_MAX_DT).y[:, -1],
+            np.exp(-1.9 * RATE - 0.1 * there),
+        )
         assert np.max(np.abs(got / right - 1)) < 100 * rtol
 
 
@@ -58,8 +75,7 @@ def test_the_stage_between_the_stages_lies_on_an_interpolant_of_order_4():
     np.testing.assert_allclose([p(1.0) for p in weights], tsit5().weights, atol=1e-14)
 
 
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
-def test_a_square_wave_drives_an_oscillator(rtol):
+def test_a_square_wave_drives_an_oscillator():
     def field(t, y, args):
         return y[1], jnp.where(jnp.floor(t) % 2 == 0, 1.0, -1.0) - 4.0 * y[0]
 
@@ -67,14 +83,23 @@ def test_a_square_wave_drives_an_oscillator(rtol):
     for second in range(10):
         middle = (1.0 if second % 2 == 0 else -1.0) / 4
         x, v = middle + (x - middle) * np.cos(2) + v / 2 * np.sin(2), -2 * (x - middle) * np.sin(2) + v * np.cos(2)
-    run = jeuler.solve_adaptive(field, (0.0, 0.0), t1=10.0, rtol=rtol, atol=1e-3 * rtol)
-    theirs = diffrax.diffeqsolve(
-        diffrax.ODETerm(field), diffrax.Tsit5(), 0.0, 10.0, None, (jnp.asarray(0.0), jnp.asarray(0.0)),
+    y0, t1 = (jnp.asarray(0.0), jnp.asarray(0.0)), 10.0
+    for rtol, run, theirs in both_at_tolerances(field, y0, t1, None):
+        error, other = (np.hypot(y[0][-1] - x, y[1][-1] - v) / np.hypot(x, v) for y in (run, theirs))
+        assert error < 100 * rtol
+        assert error < max(10 * other, rtol)
+
+
+def both_at_tolerances(field, y0, t1, args):
+    """(rtol, states of adaptive steps, states of Tsit5 of diffrax) at three tolerances."""
+    ours = jit_in_haste(lambda rtol: jeuler.solve_adaptive(
+        field, y0, t1=t1, args=args, rtol=rtol, atol=1e-3 * rtol
+    ).y, "some")  # fmt: skip
+    theirs = jit_in_haste(lambda rtol: diffrax.diffeqsolve(
+        diffrax.ODETerm(field), diffrax.Tsit5(), 0.0, t1, None, y0, args,
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol), max_steps=100_000,
-    ).ys  # fmt: skip
-    error, other = (np.hypot(y[0][-1] - x, y[1][-1] - v) / np.hypot(x, v) for y in (run.y, theirs))
-    assert error < 100 * rtol
-    assert error < max(10 * other, rtol)
+    ).ys, "some")  # fmt: skip
+    return [(rtol, ours(rtol), theirs(rtol)) for rtol in (1e-4, 1e-6, 1e-8)]
 
 
 def test_a_ball_bounces_on_a_penalty_floor():
@@ -83,19 +108,16 @@ def test_a_ball_bounces_on_a_penalty_floor():
     scene = jeuler.Scene((jeuler.Gravity([0.0, -GRAVITY]), contact))
     state = jeuler.ParticleState(jnp.array([[0.0, HEIGHT]]), jnp.zeros((1, 2)), mass=1.0)
     (y0, args), t1 = scene.as_equation(state), 3.0
-    ours = jax.jit(lambda rtol: jeuler.solve_adaptive(
-        scene.vector_field, y0, t1=t1, args=args, rtol=rtol, atol=1e-3 * rtol
-    ).y)  # fmt: skip
-    theirs = jax.jit(lambda rtol: diffrax.diffeqsolve(
-        diffrax.ODETerm(scene.vector_field), diffrax.Tsit5(), 0.0, t1, None, y0, args,
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol), max_steps=100_000,
-    ).ys)  # fmt: skip
     exact = on_the_floor(t1)
-    for rtol in (1e-4, 1e-6, 1e-8):
-        ends = (np.array([y[0][-1, 0, 1], y[1][-1, 0, 1]]) for y in (ours(rtol), theirs(rtol)))
+    for rtol, *runs in both_at_tolerances(scene.vector_field, y0, t1, args):
+        ends = (np.array([y[0][-1, 0, 1], y[1][-1, 0, 1]]) for y in runs)
         error, other = (np.linalg.norm(end - exact) / np.linalg.norm(exact) for end in ends)
         assert error <= 100 * rtol
         assert error <= max(10 * other, rtol)
+
+
+def slower_from(t, y, time):
+    return -jnp.where(t < time, 2.0, RATE) * y
 
 
 @pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.heun_step, jeuler.rk4_step, jeuler.implicit_euler_step])
@@ -105,7 +127,7 @@ def test_a_break_gives_fixed_steps_their_order_back(step, time):
 
     def error(num_steps):
         run = jeuler.solve(
-            lambda t, y, args: -jnp.where(t < time, 2.0, RATE) * y, 1.0, dt=2.0 / num_steps, num_steps=num_steps,
+            slower_from, 1.0, dt=2.0 / num_steps, num_steps=num_steps, args=time,
             step=step, breaks=[time], save_every=num_steps,
         )  # fmt: skip
         before = min(time, 2.0)
@@ -126,7 +148,7 @@ def test_breaks_hold_backwards_in_time_beside_far_ones_and_in_a_batch_of_both_di
 
     dts, t0s = jnp.array([0.1, -0.1] * 5), jnp.array([0.0, 1.0] * 5)
     breaks = jnp.repeat(jnp.array([0.53, 0.5, 0.0, 1.0, jnp.nan]), 2)
-    ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end, argnums=2)))(dts, t0s, breaks)
+    ends, slopes = jit_in_haste(jax.vmap(jax.value_and_grad(end, argnums=2)), "great")(dts, t0s, breaks)
     np.testing.assert_allclose(ends, jnp.sign(dts) * (2 * breaks - 1), atol=1e-14)
     np.testing.assert_allclose(slopes[:4], 2 * jnp.sign(dts)[:4], atol=1e-14)
 
@@ -143,7 +165,7 @@ def test_the_derivative_by_one_of_two_breaks_at_one_time_is_nan(adaptive, deriva
             return jeuler.solve_adaptive(field, 0.0, t1=1.0, args=b, breaks=breaks).y[-1]
         return jeuler.solve(field, 0.0, dt=0.1, num_steps=10, args=b, breaks=breaks).y[-1]
 
-    slopes = jax.jit(jax.vmap(derivative(end, argnums=(0, 1)), in_axes=(None, 0)))(
+    slopes = jit_in_haste(jax.vmap(derivative(end, argnums=(0, 1)), in_axes=(None, 0)), "great")(
         0.5, jnp.array([0.2, 0.5, 0.53, 1.2])
     )
     np.testing.assert_allclose(slopes[0], [2.0, np.nan, 2.0, 2.0], atol=1e-12)
@@ -190,7 +212,7 @@ def test_the_derivative_with_respect_to_a_break_is_that_of_the_solution(derivati
             switched, 1.0, dt=0.03, num_steps=66, args=time, step=jeuler.rk4_step, breaks=jnp.array([time])
         ).y[-1]
 
-    assert derivative(adaptive)(0.8) == pytest.approx(right, rel=1e-7)
+    assert jit_in_haste(derivative(adaptive), "great")(0.8) == pytest.approx(right, rel=1e-7)
     assert derivative(fixed)(0.8) == pytest.approx(right, rel=1e-6)
     assert derivative(jax.jit(fixed))(0.8) == pytest.approx(right, rel=1e-6)
 
@@ -220,18 +242,14 @@ def test_bad_breaks_are_told(breaks, message):
 @pytest.mark.parametrize("step", [None, jeuler.extrapolated_euler(6)])
 def test_what_is_shorter_than_the_longest_gap_may_be_missed_and_longest_steps_end_that(step):
     """Pulses of 0.03 s at 57 times: a wrong answer has a gap longer than the pulse; with max_dt there is none."""
-    pulse, times, right = 0.03, np.linspace(0.3, 1.7, 57), np.exp(-RATE * 1.97)
-    f = lambda t, y, time: -jnp.where((t > time) & (t <= time + pulse), 0.0, RATE) * y  # noqa: E731
-    run = jax.jit(jax.vmap(lambda time, rtol, max_dt: jeuler.solve_adaptive(
-        f, 1.0, t1=2.0, args=time, rtol=rtol, atol=1e-3 * rtol, step=step, max_dt=max_dt
-    ), in_axes=(0, None, None)))  # fmt: skip
+    pulse, right, run = 0.03, np.exp(-RATE * 1.97), interrupted_at(step)
     missed = 0
     for rtol in (1e-4, 1e-6):
-        free = run(times, rtol, 10.0)
+        free = run(TIMES, pulse, 0.0, rtol, NO_MAX_DT)
         wrong = np.abs(free.y[:, -1] / right - 1) > 100 * rtol
         assert np.all(free.longest_gap[wrong] > pulse)
         missed += wrong.sum()
-        bound = run(times, rtol, 0.95 * pulse / (0.3 if step is None else 1 / step.order))
+        bound = run(TIMES, pulse, 0.0, rtol, 0.95 * pulse / (0.3 if step is None else 1 / step.order))
         assert np.all(bound.finished)
         assert np.all(bound.longest_gap < pulse)
         assert np.max(np.abs(bound.y[:, -1] / right - 1)) < 100 * rtol
