@@ -6,7 +6,8 @@
     python benchmarks/fits.py coverage             how often nominal 95 % intervals hold the truth, 500 records each
     python benchmarks/fits.py starts [cases]       one oscillator, starts wrong by up to 100, and aliased tenfold
     python benchmarks/fits.py net_starts [cases] [first]   a net of 5 by 5, the same, from case ``first`` on
-    python benchmarks/fits.py kills [kills]        fits killed at random moments, taken up again: the same bits or not
+    python benchmarks/fits.py kills [kills] [kind] fits killed at random moments, taken up again: the same bits or not;
+                                                   of all five kinds, or only the one of this number
     python benchmarks/fits.py profiles [side]      profile intervals of single springs of a cloth
 
 Data are made by diffrax's Tsit5 at 1e-9, or exactly; the fit runs RK4. mujoco.sysid is left out where it is not there.
@@ -240,10 +241,10 @@ def slow_fit(kind, path):
     print(digest.hexdigest(), found.message[:60], flush=True)
 
 
-def kills(count=20):
+def kills(count=20, only=None):
     """Each kind of fit killed at random moments, one after the other, and then left to end."""
     random, kinds = np.random.default_rng(0), ["search", "starts", "descent", "minibatches", "without a Jacobian"]
-    for kind in kinds:
+    for kind in kinds if only is None else kinds[only : only + 1]:
         with tempfile.TemporaryDirectory() as folder:
             command = [sys.executable, __file__, "slow_fit", kind]
             path, killed, taken_up = os.path.join(folder, "state"), 0, 0
@@ -283,8 +284,8 @@ if __name__ == "__main__":
         slow_fit(words[0], words[1] if words[1:] else None)
         sys.exit()
     numbers = [int(word) for word in words]
-    if what == "net_starts":
-        net_starts(*numbers)
+    if what in ("net_starts", "kills"):
+        {"net_starts": net_starts, "kills": kills}[what](*numbers)
     else:
         run = {
             "net": net,
@@ -292,7 +293,6 @@ if __name__ == "__main__":
             "chain": chain,
             "coverage": coverage,
             "starts": starts,
-            "kills": kills,
             "profiles": profiles,
         }[what]
         for number in numbers or [None]:
