@@ -1,5 +1,7 @@
 """`simulate` solves the equation of motion; where drag is limited, by the rule that the drags' docstrings say."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,17 +72,53 @@ def test_every_force_in_single_precision(name):
 IN_PLANE = [name for name in FORCES if name not in IN_SPACE]
 
 
-@pytest.mark.parametrize("names", [IN_PLANE, IN_SPACE], ids=["plane", "space"])
-@pytest.mark.parametrize("steps", [EXPLICIT, *([step] for step in IMPLICIT)], ids=["explicit", *IMPLICIT])
-def test_every_force_under_every_step(names, steps):
-    """All in one scene, as each step compiles for a second or more: what one does to the others' arguments shows too."""
-    forces = tuple(FORCES[name]() for name in names)
+@functools.cache
+def all_at_once(names):
+    """Forces that stand in one scene, their particles, and the vector field of that scene as a program of its own."""
+    forces, state = tuple(FORCES[name]() for name in names), force_state(names[0])
+    return forces, state, jax.jit(jeuler.Scene(forces).vector_field)
+
+
+def ran(forces, state, steps):
+    """Positions and velocities at the steps' ends, a row for each step of a run, as `simulate` makes them."""
 
     def runs(state):
-        return {step: both_ways(forces, state, STEPS[step], **TIME) for step in steps}
+        found = {step: jeuler.simulate(jeuler.Scene(forces), state, step=STEPS[step], **TIME).y for step in steps}
+        return {step: (y.position, y.velocity) for step, y in found.items()}
 
-    for step, run in compiled(runs, force_state(names[0])).items():
-        agree(*run, step)
+    return compiled(runs, state)
+
+
+@pytest.mark.parametrize("names", [IN_PLANE, IN_SPACE], ids=["plane", "space"])
+def test_every_force_under_every_explicit_step(names):
+    """All in one scene, as each step compiles for a second or more: what one does to the others' arguments shows too.
+
+    The run is followed by the steps' own functions, called one after the other on the vector field.
+    """
+    forces, state, field = all_at_once(tuple(names))
+    for step, motion in ran(forces, state, EXPLICIT).items():
+        y = state.position, jnp.where(jnp.isinf(state.mass)[:, None], 0, state.velocity)
+        for k in range(TIME["num_steps"]):
+            y = STEPS[step](field, k * TIME["dt"], y, TIME["dt"], state.mass)
+            agree([part[k + 1] for part in motion], y, step)
+
+
+@pytest.mark.parametrize("names", [IN_PLANE, IN_SPACE], ids=["plane", "space"])
+@pytest.mark.parametrize("step", IMPLICIT)
+def test_every_force_under_every_implicit_step(names, step):
+    """Each step of the run fulfils the equation that defines it: y' = y + h f(y'), or y' = y + h (f + J (y' - y))."""
+    forces, state, field = all_at_once(tuple(names))
+    motion, h = ran(forces, state, [step])[step], TIME["dt"]
+    for k in range(TIME["num_steps"]):
+        before, after = ([part[at] for part in motion] for at in (k, k + 1))
+        t = (k + 1) * h
+        if step == "implicit_euler":
+            slope = field(t, tuple(after), state.mass)
+        else:
+            moved = tuple(b - a for a, b in zip(before, after, strict=True))
+            at, along = jax.jvp(lambda y: field(t, y, state.mass), (tuple(before),), (moved,))  # noqa: B023
+            slope = [a + b for a, b in zip(at, along, strict=True)]
+        agree(after, [a + h * b for a, b in zip(before, slope, strict=True)], step)
 
 
 # --- drag that would overshoot ---------------------------------------------------------------------------------------
