@@ -23,6 +23,7 @@ from cases import (
 
 import jeuler
 from jeuler import ParticleState, Scene
+from jeuler._jax.haste import jit_in_haste
 from jeuler.particles.fields import with_required_fields
 
 RUN = {"dt": 0.01, "num_steps": 50}
@@ -32,13 +33,17 @@ def final_position(scene, state=None, **kwargs):
     return jeuler.simulate(scene, net_state() if state is None else state, **{**RUN, **kwargs}).y.position[-1]
 
 
+def derivatives(loss, x):
+    """Value, and its derivative in reverse and in forward mode."""
+    return *jax.value_and_grad(loss)(x), jax.jacfwd(loss)(x)
+
+
 @pytest.mark.parametrize("name", FORCES)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_force_keeps_shape_and_dtype(name, dtype):
     state = force_state(name, dtype)
-    force = jeuler.Scene(forces=(FORCES[name](),)).forces[0](
-        jnp.asarray(0.3, dtype), state.position, state.velocity, state.mass
-    )
+    part = jeuler.Scene(forces=(FORCES[name](),)).forces[0]
+    force = jit_in_haste(part, "great")(jnp.asarray(0.3, dtype), state.position, state.velocity, state.mass)
     assert (force.shape, force.dtype) == (state.position.shape, dtype)
     assert np.isfinite(force).all()
 
@@ -51,13 +56,12 @@ def test_force_under_jit_vmap_and_grad(name):
     def loss(scale):
         return jnp.sum(force(0.3, scale * state.position, scale * state.velocity, state.mass) ** 2)
 
-    compiled, h = jax.jit(jax.value_and_grad(loss)), 1e-6
-    value, slope = compiled(1.1)
-    np.testing.assert_allclose(value, loss(1.1), rtol=1e-12)
-    np.testing.assert_allclose(jax.jit(jax.vmap(loss))(np.array([0.9, 1.1])), [compiled(0.9)[0], value], rtol=1e-12)
-    difference = (compiled(1.1 + h)[0] - compiled(1.1 - h)[0]) / (2 * h)
-    np.testing.assert_allclose(slope, difference, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(loss))(1.1), slope, rtol=1e-10, atol=1e-13)
+    h, at = 1e-6, np.array([0.9, 1.1])
+    batch, value, slope, forward = jit_in_haste(lambda x: (jax.vmap(loss)(x), *derivatives(loss, x[1])), "great")(at)
+    np.testing.assert_allclose(batch, [loss(0.9), loss(1.1)], rtol=1e-12)
+    np.testing.assert_allclose(value, batch[1], rtol=1e-12)
+    np.testing.assert_allclose(slope, (loss(1.1 + h) - loss(1.1 - h)) / (2 * h), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(forward, slope, rtol=1e-10, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", INTERNAL_FORCES)
@@ -100,7 +104,8 @@ def effect_scene(name, ks=30.0):
 def test_effect_keeps_structure_shapes_and_dtypes(name, dtype):
     scene, state = effect_scene(name)
     before = with_required_fields(state(dtype), scene.forces, scene.effects)
-    after = jax.jit(scene.effects[-1])(jnp.asarray(0.4, dtype), jnp.asarray(0.1, dtype), before, jax.random.key(0))
+    of = jnp.asarray(0.4, dtype), jnp.asarray(0.1, dtype), before, jax.random.key(0)
+    after = jax.eval_shape(scene.effects[-1], *of)  # compiled runs are below
     assert jax.tree.structure(after) == jax.tree.structure(before)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
@@ -115,11 +120,11 @@ def test_effect_under_jit_vmap_and_grad(name):
         end = jeuler.simulate(scene, state(), dt=0.02, num_steps=10, save_every=10, key=jax.random.key(0))
         return jnp.sum(end.y.position[-1] ** 2)
 
-    compiled, h = jax.jit(jax.value_and_grad(loss)), 1e-4
-    value, slope = compiled(30.0)
-    np.testing.assert_allclose(value, loss(30.0), rtol=1e-12)
-    np.testing.assert_allclose(jax.jit(jax.vmap(loss))(np.array([20.0, 30.0])), [compiled(20.0)[0], value], rtol=1e-12)
-    difference = (compiled(30.0 + h)[0] - compiled(30.0 - h)[0]) / (2 * h)
+    h, at = 1e-4, np.array([20.0, 30.0])
+    batch, value, slope = jit_in_haste(lambda x: (jax.vmap(loss)(x), *jax.value_and_grad(loss)(x[1])), "great")(at)
+    np.testing.assert_allclose(batch, [loss(20.0), loss(30.0)], rtol=1e-12)
+    np.testing.assert_allclose(value, batch[1], rtol=1e-12)
+    difference = (loss(30.0 + h) - loss(30.0 - h)) / (2 * h)
     assert difference != 0
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
