@@ -184,6 +184,7 @@ SAMPLES = np.array([[[0.0, 0.0]], [[0.1, 0.2]], [[0.3, 0.1]], [[0.2, 0.0]]])
 POOL = ("alive", "births", "missed_births", "steps")
 PLACE, SPEED = [0.5, 2.0], [0.1, 0.3]
 LIFE = jeuler.Lifetime(0.5)
+ONE_DIES = jeuler.Death(lambda t, state: (t > 0.07) & (jnp.arange(len(state.position)) == 1))
 SOLIDS = (FLOOR, jeuler.Sphere([2.0, 2.0], 0.2), jeuler.Box([-2.0, 1.0], 0.3))
 
 EFFECTS = {
@@ -198,6 +199,13 @@ EFFECTS = {
     "neighbours": effect(
         lambda: jeuler.Neighbours(1.0, 0.2, capacity=3),
         "neighbours", "neighbours_made_at", "has_neighbours", "missed_neighbours",
+    ),
+    "trail": effect(lambda: jeuler.Trail(3, every=2), "trail", "steps"),
+    "sub_emitter": effect(
+        lambda: jeuler.SubEmitter(1, SPEED, inherit=0.5, color=np.ones(3)), *POOL, "color", "generation", needs=(ONE_DIES,)
+    ),
+    "sub_emitter_on_contact": effect(
+        lambda: jeuler.SubEmitter(1, SPEED, PLACE, contact=jeuler.Plane([0.0, 0.3], [0.0, 1.0])), *POOL, "generation"
     ),
     "speed_limit": effect(lambda: jeuler.SpeedLimit(0.5)),
     "emitter": effect(lambda: jeuler.Emitter(40.0, PLACE, SPEED, max_births=2), *POOL),

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from cases import EFFECTS, FORCES, NET_EDGES, net_state
+from cases import EFFECTS, FORCES, NET_EDGES, ONE_DIES, net_state
 
 import jeuler
 from jeuler._core.component import component
@@ -177,6 +177,7 @@ GRAVITY, SPRINGS = FORCES["gravity"](), FORCES["springs"]()
 WINDY = jeuler.LinearDrag(20.0, air=[1.0, -0.5])
 OVER_LIFE = tuple(name for name in EFFECTS if name.endswith("_over_life"))
 EMITTERS = tuple(name for name in EFFECTS if name.startswith("emitter"))
+OFFSPRING = ("sub_emitter", "sub_emitter_on_contact", "trail")
 DEATHS = ("lifetime", "death", "death_outside", "death_on_contact")
 
 SCENES = {
@@ -209,6 +210,7 @@ SCENES = {
         builtin=EMITTERS[:1],
     ),
     "births of other kinds": HookScene((GRAVITY,), pool=True, builtin=EMITTERS[1:]),
+    "offspring": HookScene((GRAVITY,), (ONE_DIES,), pool=True, builtin=OFFSPRING),
     "deaths": HookScene((FORCES["viscosity"](), GRAVITY), builtin=DEATHS, step=jeuler.linearly_implicit_euler_step),
     "appearance": HookScene((GRAVITY,), builtin=("lifetime", *OVER_LIFE)),
 }

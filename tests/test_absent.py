@@ -87,7 +87,7 @@ def test_a_force_that_is_absent_leaves_no_trace(name, monkeypatch):
 def test_an_effect_that_is_absent_leaves_no_trace(name, monkeypatch):
     row = cases.EFFECTS[name]
     scene, position, before, result = base(2)
-    effect, needed = row.make(), {field for part in row.needs for field in (*part.writes, *part.sets)}
+    effect, needed = row.make(), {field for part in row.needs for field in (*part.writes, *getattr(part, "sets", ()))}
     full = Scene(scene.forces, (*row.needs, effect))
     assert jaxpr(full, position) != before, "the test would see an effect that is there"
     assert fields(full, position) == BARE | row.fields | needed, "only its own fields, and those that it needs"

@@ -28,6 +28,8 @@ from jeuler.effects import (
     PrescribedMotion,
     SampledPath,
     SpeedLimit,
+    SubEmitter,
+    Trail,
 )
 from jeuler.forces import (
     AppliedForce,
@@ -177,7 +179,9 @@ __all__ = [
     "StrandBending",
     "StrandCore",
     "Strings",
+    "SubEmitter",
     "Torsion",
+    "Trail",
     "Trajectory",
     "TriangleContact",
     "Turbulence",

@@ -32,7 +32,7 @@ from jeuler import (
     simulate,
     symplectic_euler_step,
 )
-from jeuler.effects.births import first_free
+from jeuler.effects.pool import first_free
 from jeuler.particles.fields import uses
 from jeuler.particles.protocols import Context
 from jeuler.particles.state import empty_pool

@@ -68,6 +68,12 @@ if TYPE_CHECKING:
         def __get__(self, component: Any, owner: Any = None) -> Any: ...
         def __set__(self, component: Any, value: ColliderLike) -> None: ...
 
+    class OptionalCollider:
+        """Takes a signed distance or None, holds a component that is called with t and a point, or None."""
+
+        def __get__(self, component: Any, owner: Any = None) -> Any: ...
+        def __set__(self, component: Any, value: ColliderLike | None) -> None: ...
+
 else:
     Parameter = OptionalParameter = MovingParameter = ParticleIndices = Any
-    SampledParameter = AirParameter = ColliderParameter = Any
+    SampledParameter = AirParameter = ColliderParameter = OptionalCollider = Any

@@ -6,7 +6,9 @@ from jeuler.effects.breaking import Breaking
 from jeuler.effects.deaths import Death, DeathOnContact, DeathOutside, Lifetime
 from jeuler.effects.distance import DistanceLinks
 from jeuler.effects.neighbours import Neighbours
+from jeuler.effects.offspring import SubEmitter
 from jeuler.effects.prescribed import PrescribedMotion, SampledPath
+from jeuler.effects.trail import Trail
 
 __all__ = [
     "Breaking",
@@ -21,6 +23,8 @@ __all__ = [
     "PrescribedMotion",
     "SampledPath",
     "SpeedLimit",
+    "SubEmitter",
+    "Trail",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Births. They come before the motion of a step, in the order written."""
+"""Births at a rate and in bursts. They come before the motion of a step, in the order written."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from jeuler._core import checks, trees
 from jeuler._core.annotations import MovingParameter, Parameter, SampledParameter, default
 from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import as_component, component, store_as_float
-from jeuler._core.components import by_component
 from jeuler._core.in_time import at_time, moving
 from jeuler._core.limits import Limits, check_limits
+from jeuler.effects.pool import (
+    check_sampled_vectors,
+    fields_of_births,
+    first_free,
+    put_newborns,
+    samplers_of,
+    store_samplers,
+)  # fmt: skip
 from jeuler.particles.fields import BEFORE
-from jeuler.particles.state import COUNTERS, DEFAULTS
-from jeuler.samplers.base import Uniform, as_sampler, draw, draw_named
-
-_OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
+from jeuler.samplers.base import Uniform, draw_named
 
 
 @component(static=("bursts", "max_births"))
@@ -42,7 +46,7 @@ class Emitter:
       velocity: how fast, a sampler such as `Cone` or `Normal`, or one vector (dim,), m/s.
       lifetime, mass, color, opacity, size, shape: what newborns get, a sampler or one value; None leaves the field
         out of the state, or at its default where another part of the scene has it.
-      extra: samplers of further fields, by name.
+      extra: samplers of further fields, by name; one that is in the state and not named here is 0 for a newborn.
       path: None, or a function of time ``path(t) -> (dim,)``, m, by which the places of birth move; a newborn is where
         the path was at its moment of birth.
       inherit: the share of the path's velocity that newborns have beside their own, ().
@@ -108,37 +112,12 @@ class Emitter:
             ) from None
         object.__setattr__(self, "bursts", bursts)
         store_as_float(self, "start", "stop", "inherit")
-        for name in ("position", "velocity", *_OPTIONAL):
-            value = getattr(self, name)
-            if value is None and name in ("position", "velocity"):
-                raise ValueError(f"Emitter.{name} must be a sampler such as FromDisc(...), or one vector, got None")
-            object.__setattr__(self, name, as_sampler(f"Emitter.{name}", value))
-        for name, unit in (("lifetime", "s"), ("mass", "kg")):
-            value = getattr(self, name)
-            if value is not None and not callable(value):
-                checks.above_zero(f"Emitter.{name}", value, unit)
-        if self.extra is not None:
-            if not isinstance(self.extra, dict):
-                raise ValueError(f"Emitter.extra must be a dict of samplers by name, got {checks.shown(self.extra)}")
-            extra = {name: as_sampler(f"Emitter.extra[{name!r}]", x) for name, x in self.extra.items()}
-            object.__setattr__(self, "extra", extra)
+        store_samplers(self, "position", "velocity")
         check_limits(self)
 
     @property
-    def samplers(self) -> dict[str, Any]:
-        """What newborns are given, by the name of the field."""
-        named = {name: getattr(self, name) for name in _OPTIONAL if getattr(self, name) is not None}
-        return {**named, **(self.extra or {})}
-
-    @property
     def writes(self) -> dict[str, tuple[int, ...]]:
-        """The fields, with the shape of one particle's value in those that are not the library's own."""
-
-        def one(sampler):
-            return jax.eval_shape(lambda key: draw(sampler, key, 1), jax.random.key(0)).shape[1:]
-
-        further = {name: one(sampler) for name, sampler in (self.extra or {}).items()}
-        return {**dict.fromkeys(("alive", *COUNTERS, *self.samplers), ()), **further}
+        return fields_of_births(self)
 
     def number_of_births(
         self, t: Any, dt: Any, clock: tuple[Any, Any] | None = None, steps: Array | None = None
@@ -161,40 +140,20 @@ class Emitter:
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Array, *, clock: Any = None) -> Any:
-        capacity = len(state.position)
-        block = min(self.max_births or capacity, capacity)
+        block = min(self.max_births or len(state.position), len(state.position))
         slot, free = first_free(state.alive, block)
         wanted = self.number_of_births(t, dt, clock, state.steps)
         births = jnp.minimum(wanted, jnp.minimum(free, block))
-        slot = jnp.where(jnp.arange(block) < births, slot, capacity)
-
-        def put(name: str, x: Array, newborn: Array) -> Array:
-            if newborn.shape != (block, *x.shape[1:]):
-                raise ValueError(
-                    f"Emitter.{name} must give each newborn a value of shape {x.shape[1:]}, got {newborn.shape[1:]}"
-                )
-
-            def into(x: Array, newborn: Array) -> Array:
-                return x.at[slot].set(newborn.astype(x.dtype), mode="drop")
-
-            return by_component(into, x, newborn) if name in ("position", "velocity") else into(x, newborn)
-
-        named = {"position": self.position, "velocity": self.velocity, **self.samplers}
+        named = {"position": self.position, "velocity": self.velocity, **samplers_of(self)}
         dtype = trees.time_dtype(state.position)
         values = draw_named({"moment of birth": Uniform(0.0, 1.0), **named}, key, block, dtype)
         since_step = dt * values.pop("moment of birth")
         if self.path is not None:
             values["position"], values["velocity"] = self._moving(t, values["position"], values["velocity"], since_step)
         values["position"] = values["position"] - since_step[:, None] * values["velocity"]
-        for name in state.fields():
-            if name in DEFAULTS and name not in values:
-                shape, value = DEFAULTS[name]
-                values[name] = jnp.full((block, *shape), value)
         if state.age is not None:
             values["age"] = -since_step
-        new = {name: put(name, getattr(state, name), value) for name, value in values.items()}
-        missed = add_up(state.missed_births, wanted - births)
-        return state.replace(**new, births=add_up(state.births, births), missed_births=missed)
+        return put_newborns(self, state, slot, births, wanted, values)
 
     def _moving(self, t: Any, position: Array, velocity: Array, since_step: Array) -> tuple[Array, Array]:
         """Places and velocities of newborns on the path, each where it was at the moment of birth."""
@@ -212,15 +171,7 @@ class Emitter:
         if callable(self.rate):
             form = checks.form_of("Emitter.rate", self.rate, 0.0)
             checks.shape("Emitter.rate(t)", getattr(form, "shape", ()), ())
-        count = min(self.max_births or particles, particles)
-        for name in ("position", "velocity"):
-            shape = jax.eval_shape(
-                lambda key, name=name: draw(getattr(self, name), key, count), jax.random.key(0)
-            ).shape
-            if shape != (count, dim):
-                raise ValueError(
-                    f"Emitter.{name} must give each newborn ({dim},) numbers, one a dimension, got {shape[1:]}"
-                )
+        check_sampled_vectors(self, ("position", "velocity"), particles, dim)
 
 
 def _finite_time(time: Any) -> float:
@@ -241,12 +192,6 @@ def births_of_stream(n: Array, per_step: Array) -> Array:
     return whole.astype(jnp.int32) + (before + part < before).astype(jnp.int32)
 
 
-def add_up(count: Array, more: Array) -> Array:
-    """count + more, and the greatest number there is where that is above it."""
-    most = jnp.iinfo(count.dtype).max
-    return jnp.where(count > most - more, most, count + more)
-
-
 def births_by_turns(n: Array, per_step: Array) -> Array:
     """p births in step n on average, for a p that changes: floor(p + the n-th of evenly spread fractions).
 
@@ -260,23 +205,3 @@ def births_by_turns(n: Array, per_step: Array) -> Array:
 def step_number(t: Any, dt: Any) -> Array:
     """t / dt to an integer that grows by exactly one a step: rounding puts the edge away from the usual fractions."""
     return jnp.floor(lax.stop_gradient(t / dt) + 0.618)
-
-
-def first_free(alive: Array, count: int) -> tuple[Array, Array]:
-    """The first ``count`` free slots in order, and how many are free in all; past these the slots mean nothing.
-
-    By words of 32 slots, a bit each: the running sum goes over words, not slots, and the n-th bit of a word is found
-    by counting in it.
-    """
-    words = -(-len(alive) // 32)
-    free = jnp.pad(~alive, (0, 32 * words - len(alive))).reshape(words, 32)
-    lane = jnp.arange(32, dtype=jnp.uint32)
-    bits = jnp.sum(free.astype(jnp.uint32) << lane, axis=1, dtype=jnp.uint32)
-    in_word = lax.population_count(bits).astype(jnp.int32)
-    up_to = jnp.cumsum(in_word)
-    rank = jnp.arange(count, dtype=jnp.int32)
-    word = jnp.minimum(jnp.searchsorted(up_to, rank, side="right", method="scan_unrolled"), words - 1)
-    left = rank - (up_to - in_word)[word]  # set bits of this word to pass by
-    up_to_lane = bits[word][:, None] & (jnp.uint32(0xFFFFFFFF) >> (31 - lane))
-    bit = jnp.sum(lax.population_count(up_to_lane).astype(jnp.int32) <= left[:, None], axis=1, dtype=jnp.int32)
-    return 32 * word + bit, up_to[-1]

@@ -96,7 +96,7 @@ def name_of(part: Any) -> str:
 
 
 def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: Iterable[Any]) -> ParticleState:
-    """The state with every field that the effects write; ValueError if a field is missing or in conflict."""
+    """The state with every field that the effects write; ValueError if one is missing, in conflict, or in bad order."""
     effects = tuple(effects)
     shapes: dict[str, Any] = {}
     for effect in effects:
@@ -109,6 +109,8 @@ def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: I
                         f"{name_of(effect)} sets {field!r} of every particle at each step, and {name_of(other)} "
                         f"writes it too: one of them would be lost; take one of the two out of Scene.effects"
                     )
+    for k, effect in enumerate(effects):
+        declared(effect, "check_order", lambda *_: None)(effects[:k], effects[k + 1 :])
     written = [name for effect in effects for name in (*declared(effect, "writes"), *declared(effect, "sets"))]
     state = with_default_fields(state, tuple(dict.fromkeys(written)), shapes)
     for part in (*forces, *effects):

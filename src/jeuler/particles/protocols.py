@@ -138,6 +138,9 @@ class EffectHooks(Effect, Protocol):
     def check(self, particles: int, dim: int) -> None:
         """ValueError if it does not fit so many particles. Called by `simulate`, before tracing."""
 
+    def check_order(self, before: tuple[Any, ...], after: tuple[Any, ...]) -> None:
+        """ValueError if its place among the other effects, those before it and after it, would make its work wrong."""
+
 
 class ColliderHooks(Collider, Protocol):
     """What a collider may have beside its call."""
@@ -157,6 +160,6 @@ class SamplerHooks(Sampler, Protocol):
 
 
 HOOKS = (
-    "acts", "at", "check", "drag", "energy", "max_births", "needs", "numbers", "prepare", "prescribe", "reads", "sets",
-    "writes",
+    "acts", "at", "check", "check_order", "drag", "energy", "max_births", "needs", "numbers", "prepare", "prescribe",
+    "reads", "sets", "writes",
 )  # fmt: skip

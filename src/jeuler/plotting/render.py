@@ -79,7 +79,8 @@ def draw(
 ) -> Any:  # fmt: skip
     """Draw the particles of one moment, and of the scene its springs and colliders.
 
-    Particles take colour, opacity, size (m) and shape from the state; the dead are not drawn.
+    Particles take colour, opacity, size (m) and shape from the state; the dead are not drawn. Where a `Trail` is in the
+    state, the way of each is a line of its colour that fades.
 
     Args:
       frame: a `ParticleState`, position (particle, dim) with dim 1, 2 or 3; what moves on a line is drawn along it.
@@ -166,6 +167,16 @@ def color_of_strain(force: Any, position: np.ndarray, t: float) -> np.ndarray:
     return STRAIN(np.clip(0.5 + strain / 0.4, 0, 1))
 
 
+def trails_of(frame: ParticleState, alive: np.ndarray, rgba: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The way of each particle that is drawn, (particle, point, dim), from where it is back, and its fading colours."""
+    position = np.asarray(frame.position)[alive]
+    ways = np.concatenate([position[:, None], position[:, None] + np.asarray(frame.trail)[alive]], axis=1)
+    points = ways.shape[1]
+    fading = rgba[alive][:, None].repeat(points, axis=1)
+    fading[..., 3] *= np.linspace(1, 0, points) ** 1.5
+    return ways, fading
+
+
 @dataclasses.dataclass(frozen=True)
 class AlongLine:
     """A collider of the line, drawn in the plane: all heights are alike."""
@@ -203,6 +214,7 @@ class Picture:
             self.dot_size = 2 * DEFAULT_SIZE
         self.lines = [self._new_lines() for _ in self.springs]
         self.faces = None if look.faces is None else self._new_faces()
+        self.trails = self._new_lines() if hasattr(frame, "trail") else None
         self.dots: list[PathCollection] = []
         self.solids: list[Any] = []
         turning = self.dim == 3 and callable(view.camera.azimuth)
@@ -249,6 +261,11 @@ class Picture:
             self.faces.set_verts(position[corners])
             self.faces.set_facecolor(color)
             self.faces.set_edgecolor(color)
+        if self.trails is not None:
+            ways, fading = trails_of(frame, alive, rgba)
+            pieces = in_plane(np.stack([ways[:, :-1], ways[:, 1:]], axis=2))
+            self.trails.set_segments(pieces.reshape(-1, *pieces.shape[2:]))
+            self.trails.set_color(fading[:, 1:].reshape(-1, 4))
         for dots in self.dots:
             dots.remove()
         self.dots = self._draw_particles(frame, position, alive, rgba) if self.look.particles else []

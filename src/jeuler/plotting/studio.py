@@ -16,7 +16,16 @@ from jeuler.particles.state import ParticleState
 from jeuler.plotting.camera import Camera, View
 from jeuler.plotting.light import light_through
 from jeuler.plotting.models import Model, Shadows, bake, copies, frame_along, model, unit
-from jeuler.plotting.render import Look, alive_of, colliders_of, color_of_strain, colors_of, ends_of, springs_of
+from jeuler.plotting.render import (
+    Look,
+    alive_of,
+    colliders_of,
+    color_of_strain,
+    colors_of,
+    ends_of,
+    springs_of,
+    trails_of,
+)
 from jeuler.plotting.surfaces import ball, fine_mesh_of
 
 FINER = 2  # pixels drawn for one of the picture, each way
@@ -84,6 +93,7 @@ class Studio:
         self.pv, self.scene, self.look, self.t = pv, scene, look, t
         alive = alive_of(frame)
         self.index = np.flatnonzero(alive)
+        self.trails = trails_of(frame, alive, colors_of(frame)) if hasattr(frame, "trail") else None
         self.position, self.velocity = np.asarray(frame.position, float), np.asarray(frame.velocity, float)
         self.rgba, self.size = colors_of(frame), None if frame.size is None else np.asarray(frame.size)
         self.view = View.of(camera, self.position[None], alive[None])
@@ -207,7 +217,7 @@ class Studio:
         return [copies(shape, self.position[self.index], size, self.rgba[self.index], way)]
 
     def _curves(self) -> list[tuple[np.ndarray, np.ndarray, float]]:
-        """Hair, springs and streaks: curves (curve, point, 3), colours (curve, point, 4), width."""
+        """Hair, springs, trails and streaks: curves (curve, point, 3), colours (curve, point, 4), width."""
         made = []
         if self.look.hair is not None:
             curves, rgba = self.look.hair.lit(self.position, self.rgba, self.sun, self.toward)
@@ -218,6 +228,8 @@ class Studio:
             color = self.rgba[edges].mean(axis=1) if self.look.links == "color" else strain
             here = np.isin(edges, self.index).all(axis=1)
             made.append((ends_of(force, self.position)[here], color[here][:, None].repeat(2, 1), self.look.width))
+        if self.trails is not None:
+            made.append((*self.trails, self.look.width))
         if self.look.particles == "streaks":
             back = SHUTTER * np.linspace(1, 0, 6)[:, None]
             curves = self.position[self.index][:, None] - back * self.velocity[self.index][:, None]
