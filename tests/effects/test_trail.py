@@ -51,7 +51,7 @@ def test_a_newborn_in_the_slot_of_one_that_died_in_the_step_has_a_trail_of_its_o
 
 
 def test_what_moves_particles_after_it_is_refused():
-    with pytest.raises(ValueError, match="Trail must stand .* got Collisions after it; put Trail last"):
+    with pytest.raises(ValueError, match="Trail must stand in Scene.effects last, .* wrong side of Collisions"):
         simulate(
             Scene((), (Trail(2), Collisions((FLOOR,)))), jeuler.ParticleState(jnp.ones((1, 2)), jnp.ones((1, 2))),
             dt=DT, num_steps=1,

@@ -11,7 +11,7 @@ from jax import Array, lax
 from jeuler._core import checks, trees
 from jeuler._core.annotations import OptionalCollider, Parameter, SampledParameter, default
 from jeuler._core.calls import previous_is_optional
-from jeuler._core.component import component, store_as_float, unwrapped
+from jeuler._core.component import component, store_as_float
 from jeuler._core.limits import Limits, check_limits
 from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.effects.pool import (
@@ -22,7 +22,7 @@ from jeuler.effects.pool import (
     samplers_of,
     store_samplers,
 )  # fmt: skip
-from jeuler.particles.fields import AFTER, BEFORE, acts, declared, name_of
+from jeuler.particles.fields import AFTER, BEFORE
 from jeuler.particles.state import FieldForm
 from jeuler.samplers.base import draw_named
 
@@ -92,7 +92,7 @@ class SubEmitter:
     generations: int = 1
     max_births: int | None = None
 
-    needs: ClassVar[tuple[str, ...]] = ("key", "forward time")
+    needs: ClassVar[tuple[str, ...]] = ("key", "forward time", "the events")
     limits: ClassVar[Limits] = {"inherit": ("", ""), "margin": ("", "m"), "slowest": (">= 0", "m/s")}
 
     def __post_init__(self) -> None:
@@ -175,27 +175,3 @@ class SubEmitter:
         if self.contact is not None:
             check_collider(self.contact, dim)
         check_sampled_vectors(self, ("velocity", *([] if self.position is None else ["position"])), particles, dim)
-
-    def check_order(self, before: tuple[Any, ...], after: tuple[Any, ...]) -> None:
-        if self.contact is not None:
-            hiding = [part for part in after if declared(part, "colliders")]
-            where = "after it, as it looks at where particles are after them"
-        else:
-            hiding = [part for part in after if _kills(part)]
-            last = max((k for k, part in enumerate(before) if _kills(part)), default=len(before))
-            births = [part for part in before[last:] if acts(part) == BEFORE and _has_births(part)]
-            hiding += [part for part in births if not isinstance(unwrapped(part), SubEmitter)]
-            where = "after the deaths that it looks at, and before the births that fill their slots"
-        if hiding:
-            raise ValueError(
-                f"SubEmitter must stand in Scene.effects {where}, got it on the wrong side of {name_of(hiding[0])}; "
-                f"move one of the two"
-            )
-
-
-def _has_births(effect: Any) -> bool:
-    return hasattr(unwrapped(effect), "max_births")
-
-
-def _kills(effect: Any) -> bool:
-    return acts(effect) == BEFORE and "alive" in declared(effect, "writes") and not _has_births(effect)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jeuler._core import checks
 from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import component
-from jeuler.particles.fields import AFTER, acts, name_of
+from jeuler.particles.fields import AFTER
 from jeuler.particles.state import FieldForm
 
 
@@ -40,7 +40,7 @@ class Trail:
     every: int = 1
 
     acts = AFTER
-    needs: ClassVar[tuple[str, ...]] = ("clock",)
+    needs: ClassVar[tuple[str, ...]] = ("clock", "the last place")
 
     def __post_init__(self) -> None:
         for name in ("points", "every"):
@@ -59,11 +59,3 @@ class Trail:
         places = state.trail + back
         sampled = jnp.concatenate([back, places[:, :-1]], axis=1)
         return state.replace(trail=jnp.where(ended % self.every == 1 % self.every, sampled, places))
-
-    def check_order(self, before: tuple[Any, ...], after: tuple[Any, ...]) -> None:
-        for effect in after:
-            if acts(effect) == AFTER:
-                raise ValueError(
-                    f"Trail must stand in Scene.effects after what moves particles after the motion, got "
-                    f"{name_of(effect)} after it; put Trail last"
-                )

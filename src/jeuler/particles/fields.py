@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable)
 
 BEFORE, AFTER, START = ACTS = ("before motion", "after motion", "start and after motion")
 Acts = Literal["before motion", "after motion", "start and after motion"]
-Need = Literal["key", "clock", "forward time", "prescribed pinned", "the solve"]
+Need = Literal["key", "clock", "forward time", "prescribed pinned", "the solve", "the events", "the last place"]
 
 
 @says_what_to_write()
@@ -109,8 +109,7 @@ def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: I
                         f"{name_of(effect)} sets {field!r} of every particle at each step, and {name_of(other)} "
                         f"writes it too: one of them would be lost; take one of the two out of Scene.effects"
                     )
-    for k, effect in enumerate(effects):
-        declared(effect, "check_order", lambda *_: None)(effects[:k], effects[k + 1 :])
+    _check_order(effects)
     written = [name for effect in effects for name in (*declared(effect, "writes"), *declared(effect, "sets"))]
     state = with_default_fields(state, tuple(dict.fromkeys(written)), shapes)
     for part in (*forces, *effects):
@@ -121,6 +120,36 @@ def with_required_fields(state: ParticleState, forces: Iterable[Any], effects: I
                     f"{_PROVIDERS.get(field, '')}, or give it with the state, state.replace({field}=...)"
                 )
     return state
+
+
+def _check_order(effects: tuple[Any, ...]) -> None:
+    """ValueError where an effect stands on the side of another from which it cannot see what that does."""
+
+    def has_births(effect):
+        return acts(effect) == BEFORE and declared(effect, "max_births", has_births) is not has_births
+
+    def kills(effect):
+        return acts(effect) == BEFORE and "alive" in declared(effect, "writes") and not has_births(effect)
+
+    for k, effect in enumerate(effects):
+        before, after = effects[:k], effects[k + 1 :]
+        hiding, where = [], ""
+        if needs(effect, "the events") and acts(effect) == BEFORE:
+            where = "after the deaths that it looks at, and before the births that fill their slots"
+            last = max((n for n, other in enumerate(before) if kills(other)), default=k)
+            filled = [other for other in before[last:] if has_births(other) and not needs(other, "the events")]
+            hiding = [*(other for other in after if kills(other)), *filled]
+        elif needs(effect, "the events"):
+            where = "after the colliders, as it looks at where particles are after them"
+            hiding = [other for other in after if "unresolved_contacts" in declared(other, "writes")]
+        elif needs(effect, "the last place"):
+            where = "last, after all that acts after the motion"
+            hiding = [other for other in after if acts(other) == AFTER]
+        if hiding:
+            raise ValueError(
+                f"{name_of(effect)} must stand in Scene.effects {where}, got it on the wrong side of "
+                f"{name_of(hiding[0])}; move one of the two"
+            )
 
 
 _PROVIDERS = {

@@ -124,7 +124,10 @@ class EffectHooks(Effect, Protocol):
     keyword's default, n the steps taken before this one; "forward time", dt > 0; "prescribed pinned", mass inf of
     prescribed particles as of pinned ones; "the solve", a place in the equation of steps that solve for their end:
     ``answer(t, dt, state, acceleration)``, of the state at the start and the acceleration there, gives a function of
-    the velocities at the end, (particle, dim), to what is added to them, and the call gets ``acceleration=`` too."""
+    the velocities at the end, (particle, dim), to what is added to them, and the call gets
+    ``acceleration=`` too. And a place among the other effects: "the events", before the motion after those that let
+    particles die and before births into their slots, after the motion after `Collisions`; "the last place", after all
+    that act after the motion."""
 
     max_births: int | None
     """The most births in a step, None for no limit: windows must hold them."""
@@ -137,9 +140,6 @@ class EffectHooks(Effect, Protocol):
 
     def check(self, particles: int, dim: int) -> None:
         """ValueError if it does not fit so many particles. Called by `simulate`, before tracing."""
-
-    def check_order(self, before: tuple[Any, ...], after: tuple[Any, ...]) -> None:
-        """ValueError if its place among the other effects, those before it and after it, would make its work wrong."""
 
 
 class ColliderHooks(Collider, Protocol):
@@ -160,6 +160,6 @@ class SamplerHooks(Sampler, Protocol):
 
 
 HOOKS = (
-    "acts", "at", "check", "check_order", "drag", "energy", "max_births", "needs", "numbers", "prepare", "prescribe",
-    "reads", "sets", "writes",
+    "acts", "at", "check", "drag", "energy", "max_births", "needs", "numbers", "prepare", "prescribe", "reads", "sets",
+    "writes",
 )  # fmt: skip
