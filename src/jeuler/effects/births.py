@@ -18,6 +18,7 @@ from jeuler.effects.pool import (
     check_sampled_vectors,
     fields_of_births,
     first_free,
+    most_births,
     put_newborns,
     samplers_of,
     store_samplers,
@@ -101,8 +102,6 @@ class Emitter:
         if self.path is not None:
             checks.function("Emitter.path", self.path, "(t) -> (dim,)", "write lambda t: jnp.stack([...])")
             object.__setattr__(self, "path", as_component(self.path))
-        if self.max_births is not None:
-            checks.count("Emitter.max_births", self.max_births, least=1)
         try:
             bursts = tuple((_finite_time(time), checks.count("number", number)) for time, number in self.bursts)
         except (TypeError, ValueError):
@@ -140,7 +139,7 @@ class Emitter:
 
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Array, *, clock: Any = None) -> Any:
-        block = min(self.max_births or len(state.position), len(state.position))
+        block = most_births(self, len(state.position))
         slot, free = first_free(state.alive, block)
         wanted = self.number_of_births(t, dt, clock, state.steps)
         births = jnp.minimum(wanted, jnp.minimum(free, block))

@@ -18,6 +18,7 @@ from jeuler.effects.pool import (
     check_sampled_vectors,
     fields_of_births,
     first_free,
+    most_births,
     put_newborns,
     samplers_of,
     store_samplers,
@@ -98,8 +99,6 @@ class SubEmitter:
     def __post_init__(self) -> None:
         for name in ("births", "generations"):
             object.__setattr__(self, name, checks.count(f"SubEmitter.{name}", getattr(self, name), least=1))
-        if self.max_births is not None:
-            checks.count("SubEmitter.max_births", self.max_births, least=1)
         if isinstance(self.inherits, str) or not all(isinstance(name, str) for name in self.inherits):
             raise ValueError(
                 f"SubEmitter.inherits must be a tuple of names of fields, got {checks.shown(self.inherits)}; "
@@ -127,8 +126,9 @@ class SubEmitter:
     @previous_is_optional
     def __call__(self, t: Any, dt: Any, previous: Any, state: Any, key: Array) -> Any:
         previous = state if previous is None else previous
-        block = min(self.max_births or len(state.position), len(state.position))
-        of = self._deaths(previous, state) if self.contact is None else self._contacts(t, dt, previous, state)
+        block = most_births(self, len(state.position))
+        died = previous.alive & ~state.alive
+        of = died if self.contact is None else self._contacts(t, dt, previous, state)
         of = of & (state.generation < self.generations)
         wanted = self.births * jnp.sum(of, dtype=jnp.int32)
         of = of & jnp.all(jnp.isfinite(state.position) & jnp.isfinite(state.velocity), axis=1)
@@ -144,9 +144,6 @@ class SubEmitter:
         values["velocity"] = values["velocity"] + self.inherit * state.velocity[parent]
         values["generation"] = state.generation[parent] + 1
         return put_newborns(self, state, slot, births, wanted, values)
-
-    def _deaths(self, previous: Any, state: Any) -> Array:
-        return previous.alive & ~state.alive
 
     def _contacts(self, t: Any, dt: Any, previous: Any, state: Any) -> Array:
         """Who came to the surface in the step: within the margin at its end, or turned back on the way.

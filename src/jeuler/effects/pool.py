@@ -19,6 +19,8 @@ OPTIONAL = ("mass", "lifetime", "color", "opacity", "size", "shape")
 def store_samplers(effect: Any, *required: str) -> None:
     """Turn what newborns are given into samplers; one ValueError if a value is none, or out of range."""
     kind = type(effect).__name__
+    if effect.max_births is not None:
+        checks.count(f"{kind}.max_births", effect.max_births, least=1)
     for name in (*required, *OPTIONAL):
         value = getattr(effect, name)
         if value is None and name in required:
@@ -51,9 +53,14 @@ def fields_of_births(effect: Any) -> dict[str, Any]:
     return {**dict.fromkeys(("alive", *COUNTERS, *samplers_of(effect)), ()), **further}
 
 
+def most_births(effect: Any, particles: int) -> int:
+    """The most births in a step: for so many newborns values are drawn."""
+    return min(effect.max_births or particles, particles)
+
+
 def check_sampled_vectors(effect: Any, names: tuple[str, ...], particles: int, dim: int) -> None:
     """ValueError unless these samplers give each newborn one number a dimension."""
-    count = min(effect.max_births or particles, particles)
+    count = most_births(effect, particles)
     for name in names:
         shape = jax.eval_shape(lambda key, name=name: draw(getattr(effect, name), key, count), jax.random.key(0)).shape
         if shape != (count, dim):

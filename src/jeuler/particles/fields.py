@@ -126,7 +126,7 @@ def _check_order(effects: tuple[Any, ...]) -> None:
     """ValueError where an effect stands on the side of another from which it cannot see what that does."""
 
     def has_births(effect):
-        return acts(effect) == BEFORE and declared(effect, "max_births", has_births) is not has_births
+        return acts(effect) == BEFORE and hasattr(unwrapped(effect), "max_births")
 
     def kills(effect):
         return acts(effect) == BEFORE and "alive" in declared(effect, "writes") and not has_births(effect)
