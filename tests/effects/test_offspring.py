@@ -119,6 +119,13 @@ def test_balls_that_roll_rest_or_turn_in_the_air_have_no_births():
     assert float(y.velocity[-1, 2, 1]) > 0, "it turned back far from the floor"
 
 
+@pytest.mark.parametrize("distance", [0.0, -0.05])
+def test_what_touches_at_the_start_is_there_already(distance):
+    dust = SubEmitter(1, STILL, contact=FLOOR)
+    state = pool(((0.0, distance), (0.0, -1.0)), ((1.0, distance), STILL))
+    assert touches(run(Scene((), (Collisions((FLOOR,), restitution=1.0), dust)), state, 3)) == [0] * 3
+
+
 def test_a_floor_that_comes_to_a_ball_at_rest_counts():
     rising = jeuler.Plane(lambda t: jnp.stack([0.0 * t, t]), [0.0, 1.0])
     dust = SubEmitter(2, STILL, contact=rising)

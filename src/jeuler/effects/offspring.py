@@ -38,8 +38,9 @@ class SubEmitter:
     effect lets a particle die, and stand in Scene.effects after those effects and before any `Emitter` that would fill
     its slot; newborns get slots that were free before. With it, births come after the motion of a step in which a
     particle comes to the surface faster than ``slowest``: it is within the margin at the end, or was turned back in the
-    step, less than a step and a half's way from it. The derivative by what decides births, where and when, is 0; places
-    and velocities of newborns have that by those of p and v.
+    step, less than a step and a half's way from it. One that is within the margin before the motion is there already
+    and has none, be it at rest, touching at the start, or on its way in. The derivative by what decides births,
+    where and when, is 0; places and velocities of newborns have that by those of p and v.
 
     A birth that finds no free slot, or goes beyond ``max_births``, or is due to a particle that is not finite, is
     counted in ``state.missed_births``; all that take place are counted in ``state.births``.
