@@ -46,3 +46,30 @@ def move(
 @wp.kernel
 def sum_of_squares(x: wp.array(dtype=wp.vec3), total: wp.array(dtype=float)):
     wp.atomic_add(total, 0, wp.dot(x[wp.tid()], x[wp.tid()]))
+
+
+@wp.kernel
+def soft_repulsion_step(
+    grid: wp.uint64,
+    x: wp.array(dtype=wp.vec3),
+    v: wp.array(dtype=wp.vec3),
+    x_next: wp.array(dtype=wp.vec3),
+    v_next: wp.array(dtype=wp.vec3),
+    diameter: float,
+    ks: float,
+    box: float,
+    dt_over_mass: float,
+    dt: float,
+):
+    i = wp.tid()
+    f = wp.vec3(0.0, 0.0, 0.0)
+    near = wp.hash_grid_query(grid, x[i], diameter)
+    j = int(0)  # noqa: UP018, RUF046 (a variable of the kernel; a literal would be a constant)
+    while wp.hash_grid_query_next(near, j):
+        d = x[i] - x[j]
+        d = d - box * wp.vec3(wp.round(d[0] / box), wp.round(d[1] / box), wp.round(d[2] / box))
+        r = wp.length(d)
+        if j != i and r < diameter and r > 0.0:
+            f = f + ks * (diameter - r) / r * d
+    v_next[i] = v[i] + dt_over_mass * f
+    x_next[i] = x[i] + dt * v_next[i]

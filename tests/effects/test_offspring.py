@@ -150,6 +150,40 @@ def test_windows_and_batches_give_the_same_run(windows):
     assert int(plain.births[-1]) > 16
 
 
+STEPS = ["symplectic_euler", "rk4", "implicit_euler", "implicit_midpoint"]
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_every_step_has_the_same_births(name):
+    """Two balls fall by 1.1 m, to the floor in the fifth step; one dies on the way."""
+    step = getattr(jeuler, f"{name}_step")
+    effects = (
+        Lifetime(),
+        SubEmitter(2, STILL),
+        Collisions((FLOOR,), radius=0.1, restitution=0.0),
+        SubEmitter(3, STILL, contact=FLOOR, margin=0.1 + 1e-9),
+    )
+    lifetime = jnp.where(jnp.arange(12) == 0, 0.15, 9.0)
+    state = pool(((0.0, 1.2), STILL), ((0.2, 1.2), STILL)).replace(lifetime=lifetime)
+    y = run(Scene((jeuler.Gravity([0.0, -9.81]),), effects), state, 8, step=step)
+    assert y.births.tolist() == [0, 0, 0, 2, 2, 5, 5, 5, 5]
+    assert int(y.missed_births[-1]) == 0
+    assert y.generation[-1, y.alive[-1]].tolist() == [1, 0, 1, 1, 1, 1]
+
+
+def test_an_ensemble_has_the_births_of_its_members():
+    scene = Scene((), (Lifetime(0.3), SubEmitter(2, jeuler.Normal(STILL, 1.0)), jeuler.Trail(2)))
+    ends = lambda key: simulate(scene, pool((STILL, [1.0, 0.0])), dt=0.1, num_steps=5, key=key, save_every=5)  # noqa: E731
+    keys = jax.random.split(KEY, 5)
+    found = jeuler.ensemble(lambda key: ends(key).y.trail[-1], keys, batch=2)
+    np.testing.assert_allclose(found.results, jnp.stack([ends(key).y.trail[-1] for key in keys]), rtol=1e-12)
+
+
+def test_births_cannot_be_divided_over_devices_and_say_so():
+    with pytest.raises(ValueError, match="SubEmitter"):
+        jeuler.divide(Scene((), (SubEmitter(2, STILL),)), pool((STILL, STILL)), devices=2)
+
+
 def test_gradients_flow_from_newborns_to_those_that_they_come_from():
     def end(v, c):
         scene = Scene((), (Lifetime(0.2), SubEmitter(1, [1.0, 0.0], inherit=c)))

@@ -6,21 +6,30 @@ import numpy as np
 import pytest
 
 import jeuler
-from jeuler import Collisions, Emitter, Gravity, Lifetime, Plane, Scene, Trail, simulate
+from jeuler import Collisions, DistanceLinks, Emitter, Gravity, Lifetime, Plane, Scene, Trail, simulate
 
 DT = 0.1
 FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
 
 
-@pytest.mark.parametrize("every", [1, 3])
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("dt", [DT, -DT])
-def test_the_places_are_those_of_the_run(every, dtype, dt):
-    state = jeuler.ParticleState(
-        jnp.array([[0.0, 1.0], [2.0, 3.0]], dtype), jnp.array([[1.0, -3.0], [0.5, 0.0]], dtype)
-    )
-    effects = (Collisions((FLOOR,), restitution=0.5),) if dt > 0 else ()
-    y = simulate(Scene((Gravity([0.0, -9.81]),), (*effects, Trail(4, every))), state, dt=dt, num_steps=14).y
+MOVED = {
+    "freely": {},
+    "backwards": {"dt": -DT},
+    "on a floor, touching": {"effects": (Collisions((FLOOR,), radius=0.4, restitution=0.5, pairs=[[0, 1]]),)},
+    "at a rod": {"effects": (DistanceLinks([[0, 1]], 2.0),)},
+    "by an implicit step": {"step": jeuler.implicit_euler_step},
+    "by the midpoint rule": {"step": jeuler.implicit_midpoint_step},
+}
+
+
+@pytest.mark.parametrize(("every", "dtype"), [(1, jnp.float32), (3, jnp.float64)])
+@pytest.mark.parametrize("how", MOVED)
+def test_the_places_are_those_of_the_run(how, every, dtype):
+    position, velocity = jnp.array([[0.0, 0.4], [2.0, 0.4]], dtype), jnp.array([[1.0, -3.0], [0.5, 0.0]], dtype)
+    state = jeuler.ParticleState(position, velocity)
+    how = {"dt": DT, "effects": ()} | MOVED[how]
+    scene = Scene((Gravity([0.0, -9.81]),), (*how.pop("effects"), Trail(4, every)))
+    y = simulate(scene, state, num_steps=14, **how).y
     for n in range(15):
         last = every * ((n - 1) // every)  # the start of the step of the last sample
         places = [y.position[max(last - k * every, 0)] for k in range(4)] if n else [y.position[0]] * 4
@@ -48,6 +57,23 @@ def test_a_newborn_in_the_slot_of_one_that_died_in_the_step_has_a_trail_of_its_o
     went = np.asarray(y.trail[5, 0] + y.position[5, 0])
     np.testing.assert_allclose(went[0], y.position[4, 0])
     assert (np.abs(went - [5.0, 5.0]) < 0.2).all()
+
+
+def test_what_moves_a_particle_before_the_motion_moves_its_trail_along():
+    @jeuler.uses(acts="before motion")
+    def canal(t, dt, state, key):
+        """That closes on itself after 2 m."""
+        return state.replace(position=jnp.mod(state.position, 2.0))
+
+    state = jeuler.ParticleState(jnp.array([[1.8]]), jnp.ones((1, 1)))
+    y = simulate(Scene((), (canal, Trail(3))), state, dt=0.5, num_steps=4).y
+    np.testing.assert_allclose(y.position[:, 0, 0], [1.8, 2.3, 0.8, 1.3, 1.8])
+    np.testing.assert_allclose(y.trail[2:, 0, :, 0], [[-0.5, -1.0, -1.0], [-0.5, -1.0, -1.5], [-0.5, -1.0, -1.5]])
+
+
+def test_a_trail_cannot_be_divided_over_devices_and_says_so():
+    with pytest.raises(ValueError, match="Trail"):
+        jeuler.divide(Scene((), (Trail(2),)), jeuler.ParticleState(jnp.ones((4, 2)), jnp.ones((4, 2))), devices=2)
 
 
 def test_what_moves_particles_after_it_is_refused():

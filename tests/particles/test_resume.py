@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jeuler
-from jeuler import Emitter, Gravity, Lifetime, Normal, ParticleState, Scene
+from jeuler import Emitter, Gravity, Lifetime, Normal, ParticleState, Scene, SubEmitter, Trail
 
 KEY = jax.random.key(1)
 JET = Emitter(100.0, [0.0, 0.0], Normal(0.0, jnp.ones(2)), max_births=4, bursts=((0.2, 2), (0.3, 1)))
@@ -23,6 +23,10 @@ def stirred(t, dt, state, key):
 
 SCENES = {
     "births and deaths": (Scene((), (JET, Lifetime(0.11))), jeuler.empty_pool(20, 2)),
+    "births of births, with trails": (
+        Scene((), (Lifetime(0.11), SubEmitter(2, Normal(0.0, jnp.ones(2)), max_births=4), JET, Trail(3, every=2))),
+        jeuler.empty_pool(40, 2),
+    ),
     "deaths in frames": (Scene((), (JET, Lifetime(frames=11))), jeuler.empty_pool(20, 2)),
     "forces that are drawn": (Scene((), (shaken, stirred)), ParticleState(np.zeros((3, 2)), np.zeros((3, 2)))),
 }
@@ -32,7 +36,7 @@ def last(run):
     return jax.tree.map(lambda x: x[-1], run.y)
 
 
-@pytest.mark.parametrize(("name", "dtype"), list(zip(SCENES, ("float64", "float32", "float32"), strict=True)))
+@pytest.mark.parametrize(("name", "dtype"), list(zip(SCENES, ("float64", "float32", "float32", "float32"), strict=True)))
 def test_two_halves_are_one_run(name, dtype):
     scene, state = SCENES[name]
     state = state.replace(position=state.position.astype(dtype), velocity=state.velocity.astype(dtype))

@@ -17,6 +17,7 @@ from jeuler.plotting.render import colliders_of
 SHORT = {
     "fountain": 64,
     "smoke_column": 60,
+    "fireworks": 72,
     "cloth_on_sphere": 448,
     "charge": 80,
     "rain_on_pegs": 480,
@@ -56,6 +57,19 @@ def test_smoke_rises_turns_and_fades():
     assert np.corrcoef(age, x[:, 2])[0, 1] > 0.8
     assert np.corrcoef(age, np.asarray(y.opacity[-1])[alive])[0, 1] < -0.8
     assert np.mean(x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]) > 0, "counterclockwise"
+
+
+def test_rockets_burst_into_stars_of_their_colour_where_they_burn_out():
+    _, y = run("fireworks")
+    star = np.asarray(y.alive[-1] & (y.generation[-1] == 1))
+    born, missed = int(y.births[-1]), int(y.missed_births[-1])
+    assert (born > 300, missed) == (True, 0)
+    palette = {tuple(color) for color in np.asarray(y.color[-1])[star].round(4)}
+    assert 1 < len(palette) <= 5, "each burst has the colour of its rocket"
+    assert np.asarray(y.position[-1])[star][:, 2].mean() > 10.0, "high in the air"
+    way = np.linalg.norm(np.asarray(y.trail[-1]), axis=-1)
+    assert np.all(np.diff(way[star], axis=1) > -1.0)
+    assert way[star].max() > 1.0, "a trail behind each"
 
 
 def test_curls_keep_their_length_and_their_curl():

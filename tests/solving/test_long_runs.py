@@ -16,7 +16,8 @@ import xarray
 import jeuler
 
 JET = jeuler.Emitter(60.0, [0.0, 0.0], jeuler.Normal(0.0, jnp.ones(2)), max_births=2, bursts=((0.5, 3),))
-POOL = jeuler.Scene((jeuler.Gravity([0.0, -9.8]),), (JET, jeuler.Lifetime(0.4)))
+SPARKS = jeuler.SubEmitter(2, jeuler.Normal(0.0, jnp.ones(2)), max_births=4)
+POOL = jeuler.Scene((jeuler.Gravity([0.0, -9.8]),), (jeuler.Lifetime(0.4), SPARKS, JET, jeuler.Trail(3, every=2)))
 
 
 def fountain(num_steps, **how):

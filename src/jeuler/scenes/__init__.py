@@ -7,12 +7,15 @@ They are part of the package, so that notebooks, tests and people all run the sa
 """
 
 from jeuler.scenes.bodies import cloth_on_sphere, curly_hair, jelly_on_stairs
-from jeuler.scenes.pools import fountain, rain_on_pegs, smoke_column
+from jeuler.scenes.pools import fireworks, fountain, rain_on_pegs, smoke_column
 from jeuler.scenes.setup import Setup
 from jeuler.scenes.swarms import dam_break, flock
 from jeuler.scenes.terrain import charge
 
-ALL = (fountain, smoke_column, curly_hair, cloth_on_sphere, jelly_on_stairs, charge, rain_on_pegs, flock, dam_break)
+ALL = (
+    fountain, smoke_column, fireworks, curly_hair, cloth_on_sphere, jelly_on_stairs, charge, rain_on_pegs, flock,
+    dam_break,
+)  # fmt: skip
 
 __all__ = [
     "ALL",
@@ -21,6 +24,7 @@ __all__ = [
     "cloth_on_sphere",
     "curly_hair",
     "dam_break",
+    "fireworks",
     "flock",
     "fountain",
     "jelly_on_stairs",

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from jeuler.contact import Collisions, Plane
-from jeuler.effects import Emitter, Lifetime, OverLife
+from jeuler.effects import Emitter, Lifetime, OverLife, SubEmitter, Trail
 from jeuler.forces import Gravity, Gust, LinearDrag, Vortex, turbulence
 from jeuler.particles import Scene, empty_pool, uses
-from jeuler.samplers import Cone, FromDisc, FromLine, Normal, Uniform
+from jeuler.samplers import Choice, Cone, FromDisc, FromLine, FromSphere, Normal, Uniform
 from jeuler.scenes.setup import Setup
 
 
@@ -55,6 +55,24 @@ def smoke_column() -> Setup:
     camera = {"center": [0.0, 0.0, 2.35], "width": 9.0, "elevation": 8.0}
     look = {"background": "#39424d", "sky": "#0e1116", "particles": "puffs", "thickness": 0.5}
     return Setup(scene, empty_pool(6000, dim=3), 0.02, 250, 2, camera, look)
+
+
+def fireworks() -> Setup:
+    """Rockets that burst into stars of their colour where they burn out; each draws its trail."""
+    colors = [[1.0, 0.45, 0.3], [1.0, 0.8, 0.35], [0.5, 0.8, 1.0], [0.7, 1.0, 0.6], [1.0, 0.6, 0.95]]
+    rockets = Emitter(
+        rate=3.0, position=FromDisc([0.0, 0.0, 0.0], radius=7.0), velocity=Cone([0.0, 0.0, 1.0], 34.0, angle=0.15),
+        lifetime=Uniform(1.5, 2.0), color=Choice(colors), size=0.12, max_births=1,
+    )  # fmt: skip
+    stars = FromSphere([0.0, 0.0, 0.0], radius=14.0, surface=True)
+    burst = SubEmitter(
+        150, velocity=stars, inherit=0.4, lifetime=Normal(1.5, 0.2), size=0.1, inherits=("color",), max_births=360
+    )
+    fade = OverLife("opacity", [1.0, 1.0, 0.0], times=[0.0, 0.6, 1.0])
+    scene = Scene((Gravity([0.0, 0.0, -9.81]), LinearDrag(0.9)), (Lifetime(), burst, rockets, fade, Trail(12)))
+    camera = {"center": [0.0, 0.0, 14.0], "width": 44.0, "azimuth": -90.0, "elevation": 4.0}
+    look = {"background": "#1a2038", "sky": "#04060d", "haze": 0.0}
+    return Setup(scene, empty_pool(1500, dim=3), 0.04, 150, 2, camera, look)
 
 
 def rain_on_pegs(rows: int = 12, spacing: float = 0.2, drops: int = 2000) -> Setup:

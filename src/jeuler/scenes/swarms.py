@@ -62,9 +62,9 @@ def dam_break(across: int = 8, spacing: float = 0.05) -> Setup:
     walls.drawn = False  # type: ignore[attr-defined]  # of glass: the one in front would hide all
     floor = Plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     trough = Collisions((floor, walls), radius=spacing / 2, restitution=0.1)
-    state = ParticleState(position, 0 * position, mass=1000 * spacing**3, size=np.full(len(place), 1.25 * spacing))
-    middle = [long / 2, wide / 2, 0.13 * long]
-    camera = {"center": middle, "width": 1.35 * long, "elevation": 16.0, "azimuth": -65.0}
-    look = {"background": "#c9d3da", "sky": "#7d93a6", "solids": "#8d8577"}
+    state = ParticleState(position, 0 * position, mass=1000 * spacing**3, size=np.full(len(place), 1.6 * spacing))
+    middle = [long / 2, wide / 2, 0.1 * long]
+    camera = {"center": middle, "width": 1.12 * long, "elevation": 20.0, "azimuth": -78.0}
+    look = {"background": "#c9d3da", "sky": "#7d93a6", "solids": "#5f6a72"}
     scene = Scene((Gravity([0.0, 0.0, -9.81]), water), (near, trough, foam))
     return Setup(scene, state, 2e-3, 400, 10, camera, look, frame=34)
