@@ -36,7 +36,9 @@ def last(run):
     return jax.tree.map(lambda x: x[-1], run.y)
 
 
-@pytest.mark.parametrize(("name", "dtype"), list(zip(SCENES, ("float64", "float32", "float32", "float32"), strict=True)))
+@pytest.mark.parametrize(
+    ("name", "dtype"), list(zip(SCENES, ("float64", "float32", "float32", "float32"), strict=True))
+)
 def test_two_halves_are_one_run(name, dtype):
     scene, state = SCENES[name]
     state = state.replace(position=state.position.astype(dtype), velocity=state.velocity.astype(dtype))
