@@ -56,3 +56,39 @@ def test_compiled_batched_and_differentiated_it_is_the_optimum(door, way):
         moved = [float(best(noise + side * step, exact)[0]) for side in (-1, 1)]
         np.testing.assert_allclose(slopes[k][7], (moved[1] - moved[0]) / 2e-4, rtol=2e-3)
     assert ("between bounds" in way) == bool(np.all(together["params"]["kd"] == 1.0))
+
+
+def test_fits_are_members_of_an_ensemble_and_go_on_from_its_folder(tmp_path):
+    """Recordings, resampled, from starts of their own, over a mesh; stopped on the way and gone on with."""
+
+    def residual(p, data):
+        return (p["ks"] * jnp.exp(-p["kd"] * T) - data["y"]) * data["weight"]
+
+    def run(member):
+        drawn = jax.random.randint(member["key"], (21,), 0, 21)
+        weight = jnp.sqrt(jnp.bincount(drawn, length=21))
+        found = jeuler.fit(residual, member["start"], data={"y": member["y"], "weight": weight}, tolerance=1e-9)
+        return found.params | {"converged": found.converged}
+
+    members = {
+        "key": jax.random.split(jax.random.key(0), 3)[jnp.array([0, 0, 0, 1, 1, 2])],
+        "start": {"ks": jnp.array([0.1, 1.0, 30.0, 1.0, 1.0, 1.0]), "kd": jnp.ones(6)},
+        "y": FALL + jnp.asarray(NOISE)[jnp.array([0, 0, 0, 0, 1, 1])],
+    }
+    alone = [run(jax.tree.map(lambda x, k=k: x[k], members)) for k in range(6)]
+    how = {"batch": 2, "mesh": jax.make_mesh((1,), ("member",)), "resume": tmp_path / "fits", "checkpoint_every": 2}
+
+    def stop(member, of):
+        if member == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        jeuler.ensemble(run, members, reduce=jeuler.Moments(), progress=stop, **how)
+    together = jeuler.ensemble(run, members, reduce=jeuler.Moments(), **how).reduced
+    for name in ("ks", "kd"):
+        values = np.array([float(one[name]) for one in alone])
+        np.testing.assert_allclose(values[:3], values[0], rtol=1e-6, err_msg="from other starts")
+        assert np.abs(np.diff(values[2:])).min() > 1e-3, "of other recordings and draws"
+        np.testing.assert_allclose(together.mean[name], values.mean(), rtol=1e-6)
+        np.testing.assert_allclose(together.variance[name], values.var(ddof=1), rtol=1e-4)
+    assert together.mean["converged"] == 1.0

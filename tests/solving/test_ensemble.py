@@ -136,6 +136,38 @@ def test_an_ensemble_goes_on_from_its_folder_with_the_numbers_of_one_in_one_go(t
         jeuler.ensemble(trajectory, MEMBERS | {"ks": MEMBERS["ks"] + 1e-9}, **how)
 
 
+@pytest.mark.parametrize("dtype", ["bool", "int32", "float16", "float32", "float64"])
+def test_results_of_any_kind_are_reduced_and_go_on(tmp_path, dtype):
+    values = (np.arange(3001) % 3).astype(dtype)
+    how = {"reduce": BOTH, "batch": 1000, "resume": tmp_path / "run", "checkpoint_every": 1000}
+
+    def until(n, of):
+        if n == 2000:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        jeuler.ensemble(lambda x: x, values, progress=until, **how)
+    found = jeuler.ensemble(lambda x: x, values, **how).reduced["moments"]
+    np.testing.assert_allclose(found.mean, values.astype(float).mean(), rtol=1e-6)
+    np.testing.assert_allclose(found.variance, values.astype(float).var(ddof=1), rtol=1e-6)
+
+
+def test_a_reducer_whose_state_changes_its_form_cannot_be_kept_and_says_so(tmp_path):
+    class Sum:
+        def start(self, results, kept):
+            return jnp.int32(0)
+
+        def add(self, state, results, kept):
+            return state + results.sum()
+
+        merge = add
+        value = float
+
+    assert jeuler.ensemble(lambda x: x, np.ones(4), reduce=Sum()).reduced == 4.0
+    with pytest.raises(ValueError, match=r"must have the same shapes and dtypes, got int32\[\] and float64\[\]"):
+        jeuler.ensemble(lambda x: x, np.ones(4), reduce=Sum(), resume=tmp_path / "run")
+
+
 def test_results_on_disk_can_be_indexed(tmp_path):
     found = jeuler.ensemble(lambda x: {"twice": 2 * x, "sum": x.sum()}, np.ones((5, 2)), batch=2, resume=tmp_path)
     assert found.results["twice"][4].tolist() == [2.0, 2.0]

@@ -163,6 +163,10 @@ class _Work:
         batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.size, *np.shape(x)[1:]), x.dtype), members)
         real = jax.ShapeDtypeStruct((self.size,), np.bool_)
         states = jax.eval_shape(functools.partial(_first_states, Function(self.run), self.reducers, {}), batch, real)
+        later = jax.eval_shape(functools.partial(_next, Function(self.run), self.reducers, None), states, batch, real)[
+            0
+        ]
+        _check_same_form(states, later)
         # on one device, so that it does not matter which of several processes has which
         lowered, dynamic = programs.lowered(_next, (Function(self.run),), (self.reducers, None), states, batch, real)
         devices = 1 if self.mesh is None else self.mesh.size
@@ -285,6 +289,17 @@ def _finite(results: PyTree) -> Any:
     for one in found:
         whole = whole & one
     return whole
+
+
+def _check_same_form(states: dict[str, PyTree], later: dict[str, PyTree]) -> None:
+    """A state that changes its form from batch to batch cannot be known again on disk."""
+    for name, before in states.items():
+        forms = [str(jax.tree.map(lambda x: f"{x.dtype}{list(x.shape)}", tree)) for tree in (before, later[name])]
+        if forms[0] != forms[1]:
+            raise ValueError(
+                f"with resume= what start and add of a reducer return must have the same shapes and dtypes, "
+                f"got {forms[0]} and {forms[1]} {name}".rstrip()
+            )
 
 
 def _first_states(run: Function, reducers: tuple, _: PyTree, members: PyTree, real: Any) -> PyTree:

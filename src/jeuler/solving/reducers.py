@@ -40,6 +40,15 @@ class MomentsValue:
     variance: PyTree
 
 
+def _as_floats(results: PyTree) -> PyTree:
+    """Floating-point numbers of 32 bits or more: halves are too few to add up, and integers and booleans have means."""
+
+    def floats(x):
+        return x.astype(jnp.result_type(x, jnp.float32) if jnp.issubdtype(x.dtype, jnp.inexact) else float)
+
+    return jax.tree.map(floats, results)
+
+
 def _of_members(kept: Array, x: Array) -> Array:
     return kept.reshape(-1, *(1,) * (x.ndim - 1))
 
@@ -64,7 +73,7 @@ class Moments:
     """
 
     def start(self, results: PyTree, kept: Array) -> PyTree:
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], jnp.result_type(x, jnp.float32)), results)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), _as_floats(results))
         return jnp.int32(0), zeros, zeros
 
     def add(self, state: PyTree, results: PyTree, kept: Array) -> PyTree:
@@ -76,6 +85,7 @@ class Moments:
         def squares(x, mean):
             return jnp.sum(jnp.where(_of_members(kept, x), x - mean, 0) ** 2, axis=0)
 
+        results = _as_floats(results)
         means = jax.tree.map(mean, results)
         return self.merge(state, (count, means, jax.tree.map(squares, results, means)))
 
@@ -149,7 +159,6 @@ class Quantiles:
 
     def start(self, results: PyTree, kept: Array) -> PyTree:
         def of(x):
-            x = x.astype(jnp.result_type(x, jnp.float32))
             mask = _of_members(kept, x)
             low = jnp.min(jnp.where(mask, x, jnp.inf), axis=0)
             high = jnp.max(jnp.where(mask, x, -jnp.inf), axis=0)
@@ -160,7 +169,7 @@ class Quantiles:
             zeros = jnp.zeros(x.shape[1:], jnp.int32)
             return low, high, jnp.zeros((*x.shape[1:], self.bins), jnp.int32), zeros
 
-        return jax.tree.map(of, results)
+        return jax.tree.map(of, _as_floats(results))
 
     def add(self, state: PyTree, results: PyTree, kept: Array) -> PyTree:
         def of(x, old):
@@ -174,7 +183,7 @@ class Quantiles:
             beyond = jnp.sum(mask & ((x < low) | (x > high)), axis=0, dtype=jnp.int32)
             return low, high, flat.reshape(counts.shape), outside + beyond
 
-        return jax.tree.map(of, results, state)
+        return jax.tree.map(of, _as_floats(results), state)
 
     def merge(self, a: PyTree, b: PyTree) -> PyTree:
         def of(a, b):
