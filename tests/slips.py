@@ -252,7 +252,7 @@ RIGHT = {
                                                "atol": ("not negative", 1e-3), "max_steps": ("count from 1", 64)}),
     "diagnose": (jeuler.diagnose, {"scene": ("scene", NET), "state": ("state", PAIR), "dt": ("step size", 0.01), "num_steps": ("count", 1), "t0": ("any number", 0.0)}),
     "stability_limit": (jeuler.stability_limit, {"f": ("function", decay), "t": ("any number", 0.0), "y": ("y", 1.0), "step": ("step", jeuler.euler_step)}),
-    "advise_step": (jeuler.advise_step, {"f": ("function", decay), "y0": ("y", 1.0), "t1": ("positive", 1.0), "error": ("positive", 0.1), "t0": ("any number", 0.0), "step": ("step", jeuler.euler_step)}),
+    "advise_step": (jeuler.advise_step, {"f": ("function", decay), "y0": ("y", 1.0), "t1": ("positive", 1.0), "error": ("positive", 0.1), "t0": ("any number", 0.0), "step": ("step", jeuler.euler_step), "patience": ("positive", 60.0)}),
     "fit": (jeuler.fit, {"residual": ("function", lambda p: p["a"] - 2.0), "params": ("y", {"a": 1.0}), "max_iterations": ("count from 1", 2)}),
     "fit_springs": (jeuler.fit_springs, {"scene": ("scene", NET), "state": ("state", PAIR), "times": ("times", TIMES), "positions": ("points of a shape", SWING),
                                          "dt": ("positive", 0.05), "parameters": ("names", ("ks",)), "t0": ("any number", 0.0)}),

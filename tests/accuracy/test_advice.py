@@ -1,6 +1,8 @@
 """advise_step on published problems: achieved error against target; refusals with reasons."""
 
+import itertools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from published import published
 import jeuler
 from jeuler.accuracy import advise_step
 from jeuler.accuracy.pilot import Pilot, distance
+from jeuler.accuracy.search import Patience
 
 FAST = [f"DETEST_nonstiff_{name}" for name in ("A1", "A3", "A4", "B1", "B3", "B5", "C1", "D1", "E2", "E5", "F1", "F5")]
 FAST += ["DETEST_stiff_B5", "DETEST_stiff_E2", "LORENZ_111_t10"]
@@ -151,8 +154,19 @@ def test_it_refuses_below_the_roundoff_floor_of_float32_and_names_what_could():
     assert not advice.feasible
     assert math.isnan(advice.dt)
     assert "roundoff" in advice.reason
-    assert advice.reason.endswith("use float64")  # below the spacing of numbers of float32
-    assert "compensated=True" in advise_step(field, y0, t1=1.0, error=1e-6).reason
+    assert re.search("float64 may do: no run of [0-9,]+ steps was made$", advice.reason)  # half a billion of them
+    named = re.search(
+        "use compensated=True or float64 with ([0-9,]+) steps, or rk4_step with ([0-9]+) steps, as runs show$",
+        advise_step(field, y0, t1=1.0, error=1e-6).reason,
+    )
+    num_steps, of_rk4 = (int(number.replace(",", "")) for number in named.groups())
+    for start, n, how in (
+        (y0, num_steps, {"compensated": True}),
+        (jnp.float64(y0), num_steps, {}),
+        (y0, of_rk4, {"step": jeuler.rk4_step}),
+    ):
+        end = jeuler.solve(field, start, dt=1 / n, num_steps=n, save_every=n, **how).y[-1]
+        assert abs(float(end) * math.e - 1) <= 1e-6
     run = [
         abs(float(jeuler.solve(field, y0, dt=1 / n, num_steps=n, save_every=n).y[-1]) * math.e - 1)
         for n in (2**14, 2**16, 2**18)
@@ -171,13 +185,16 @@ def driven(t, y, args):
     return jnp.where(jnp.floor(t) % 2 == 0, 55 - 1.5 * y, -0.5 * y)
 
 
+DRIVEN = 19.981344941683865  # its y(20)
+
+
 @pytest.mark.parametrize("step", [jeuler.heun_step, jeuler.rk4_step])
 @pytest.mark.parametrize("target", [1e-2, 1e-3, 1e-4])
 def test_no_answer_is_above_its_target_where_the_field_switches(step, target):
     advice = advise_step(driven, 110.0, t1=20.0, error=target, step=step)
     assert advice.feasible
     run = jeuler.solve(driven, 110.0, dt=advice.dt, num_steps=advice.num_steps, step=step)
-    assert abs(float(run.y[-1]) / 19.981344941683865 - 1) <= 1.1 * target
+    assert abs(float(run.y[-1]) / DRIVEN - 1) <= 1.1 * target
 
 
 @pytest.mark.parametrize("name", [name for name in FIELDS if name != "floor"])
@@ -196,7 +213,7 @@ def test_known_breaks_let_high_orders_do_with_few_steps():
     advice = advise_step(driven, 110.0, t1=20.0, error=1e-6, step=jeuler.rk4_step, breaks=breaks)
     assert advice.num_steps < 1000
     run = jeuler.solve(driven, 110.0, dt=advice.dt, num_steps=advice.num_steps, step=jeuler.rk4_step, breaks=breaks)
-    assert abs(float(run.y[-1]) / 19.981344941683865 - 1) <= 1e-6
+    assert abs(float(run.y[-1]) / DRIVEN - 1) <= 1e-6
 
 
 def test_stiff_problems_are_answered_or_told_what_meets_the_target():
@@ -362,11 +379,45 @@ def test_it_refuses_what_it_cannot_look_into():
         ({"t1": 0.0}, "t1 must be later than t0=0"),
         ({"error": 0.0}, "error must be greater than 0"),
         ({"max_pilot_steps": 1}, "max_pilot_steps must be at least 64"),
+        ({"patience": 0.0}, "patience must be greater than 0"),
     ],
 )
 def test_bad_input_is_told(change, message):
     with pytest.raises(ValueError, match=message):
         advise_step(lambda t, y, args: -y, 1.0, **({"t1": 1.0, "error": 1e-2} | change))
+
+
+@pytest.mark.parametrize(
+    ("f", "t1", "end", "step"),
+    [(lambda t, y, args: -y, 1.0, 110 / math.e, jeuler.euler_step), (driven, 20.0, DRIVEN, jeuler.rk4_step)],
+    ids=["decay", "driven"],
+)
+def test_when_patience_is_over_what_is_known_is_answered_or_that_is_the_reason(f, t1, end, step, monkeypatch):
+    answered = set()
+    for looks in (0, 1, 3, 6, 9, 12, 50, 10_000):
+        count = itertools.count()
+        monkeypatch.setattr(Patience, "over", property(lambda patience, n=looks, count=count: next(count) >= n))
+        advice = advise_step(f, 110.0, t1=t1, error=1e-3, step=step, patience=7.0)
+        if advice.feasible:
+            run = jeuler.solve(f, jnp.asarray(110.0), dt=advice.dt, num_steps=advice.num_steps, step=step)
+            assert abs(float(run.y[-1]) / end - 1) <= 1e-3
+        else:
+            assert "patience=7 s was over before an answer was known" in advice.reason
+        answered.add(advice.feasible)
+    assert answered == {False, True}
+
+
+def test_where_no_error_follows_the_order_it_is_said_what_the_errors_are():
+    width, at = 1e-5, 0.37
+    peak = lambda t, y, args: width / ((t - at) ** 2 + width**2) + 0 * y  # noqa: E731
+    advice = advise_step(peak, 1.0, t1=1.0, error=1e-6, max_pilot_steps=4096)
+    assert not advice.feasible
+    said = re.search("with 2,048 and 4,096 steps the error is (.*) and (.*) times the target", advice.reason)
+    assert said, advice.reason
+    run = Pilot(peak, jnp.asarray(1.0), 0.0, 1.0, None, jeuler.euler_step, np.float64, False)
+    end = 1 + math.atan((1 - at) / width) + math.atan(at / width)
+    right = [abs(run(n)[-1, 0] / end - 1) / 1e-6 for n in (2048, 4096)]
+    assert [float(word.removesuffix(" times the target")) for word in said.groups()] == pytest.approx(right, rel=0.01)
 
 
 def test_traced_values_are_told():

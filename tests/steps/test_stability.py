@@ -183,6 +183,45 @@ def random_net(seed, kd=None):
     return scene, jeuler.ParticleState(jnp.asarray(x), jnp.zeros(x.shape), jnp.asarray(mass))
 
 
+def stretched_net(seed):
+    """Six particles in space, its springs up to 1 % short."""
+    random = np.random.default_rng(seed)
+    x = random.normal(size=(6, 3))
+    edges = [(i, j) for i in range(6) for j in range(i) if j == i - 1 or random.random() < 0.4]
+    length = np.array([np.linalg.norm(x[i] - x[j]) for i, j in edges]) * (1 - 0.01 * random.random(len(edges)))
+    mass = random.uniform(0.5, 2.0, 6)
+    mass[0] = np.inf
+    scene = jeuler.Scene((jeuler.Springs(edges, ks=10.0, kd=0.5, rest_length=length),))
+    return scene, jeuler.ParticleState(jnp.asarray(x), jnp.zeros(x.shape), jnp.asarray(mass))
+
+
+def test_a_stretched_net_is_stable_in_long_runs_up_to_its_limit():
+    """What 2^20 steps make of a perturbation, by the forces written out here: no growth at 0.36, growth at 0.37."""
+    scene, state = stretched_net(2)
+    springs, mass = scene.forces[0], np.asarray(state.mass)[:, None]
+    i, j = np.asarray(springs.edges).T
+    length = np.asarray(springs.rest_length)[:, None]
+
+    def acceleration(x, v):
+        along, speed = x[j] - x[i], v[j] - v[i]
+        size = jnp.linalg.norm(along, axis=1, keepdims=True)
+        unit = along / size
+        pull = (10.0 * (size - length) + 0.5 * jnp.sum(speed * unit, axis=1, keepdims=True)) * unit
+        return jnp.zeros_like(x).at[i].add(pull).at[j].add(-pull) / mass
+
+    by_x, by_v = (np.reshape(jax.jacfwd(acceleration, k)(state.position, state.velocity), (18, 18)) for k in (0, 1))
+
+    def after_many_steps(dt):
+        to_v = np.hstack([dt * by_x, np.eye(18) + dt * by_v])
+        step = np.vstack([np.hstack([np.eye(18), np.zeros((18, 18))]) + dt * to_v, to_v])
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.linalg.norm(np.linalg.matrix_power(step, 2**20))
+
+    assert after_many_steps(0.36) < 1e8  # a drift
+    assert not after_many_steps(0.37) < 1e100
+    assert 0.36 < stability_limit(scene, state, step=jeuler.symplectic_euler_step) < 0.37
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_prestressed_nets_of_unequal_masses_under_symplectic_euler(seed):
     """For symmetric K and C >= 0 it is stable exactly as long as dt^2 K + 2 dt C < 4, in units of mass."""

@@ -16,7 +16,7 @@ from jeuler._core.precision import flat
 from jeuler.accuracy.asked import Asked
 from jeuler.accuracy.pilot import Ladder, distance
 from jeuler.accuracy.roundoff import COUNTER
-from jeuler.accuracy.search import AIM, FACTOR, Search
+from jeuler.accuracy.search import AIM, FACTOR, Patience, Search
 from jeuler.steps.explicit import Step, VectorField, euler_step, rk4_step
 
 PyTree = Any
@@ -78,6 +78,7 @@ def advise_step(
     compensated: bool = False,
     breaks: Any = (),
     max_pilot_steps: int | None = None,
+    patience: float = 120.0,
 ) -> StepAdvice:
     """The largest dt whose error at t1 meets a target, from pilot runs; or a reason why no dt does.
 
@@ -124,6 +125,8 @@ def advise_step(
       max_pilot_steps: longest pilot run; None takes 2^25 over the numbers in the state, a second or so of work, a
         sixteenth of that for steps that solve equations, and never less than 4,096; or 64 times the steps that
         stability asks for, up to 8 times as many.
+      patience: seconds after which no further run is begun; the one that goes on then is at most twice as long as the
+        one before. What was found until then is answered, or the reason says that patience was over.
     Returns: `StepAdvice`; it refuses, ``feasible=False`` with the reason, rather than guess.
     Raises: ValueError, naming the argument, what was expected and what came.
     Example:
@@ -135,6 +138,8 @@ def advise_step(
     Source: L. F. Richardson, The deferred approach to the limit, Phil. Trans. R. Soc. A 226, 1927; P. Henrici, Discrete
       Variable Methods in Ordinary Differential Equations, 1962, sect. 1.4 (roundoff).
     """
+    checks.positive("patience", patience)
+    patient = Patience(patience)
     asked = Asked.of("advise_step", f, y0, t0=t0, t1=t1, args=args, error=error, relative=relative, breaks=breaks)
     checks.function("step", step, "(f, t, y, dt, args) -> y", "pass, say, jeuler.euler_step")
     checks.true_or_false("compensated", compensated)
@@ -155,6 +160,7 @@ def advise_step(
         relative=relative,
         compensated=compensated,
         most=max_pilot_steps,
+        patience=patient,
         ceiling=longer * max_pilot_steps,
         breaks=asked.breaks,
     )
@@ -208,21 +214,38 @@ class _Answer:
     def no_answer(self, ladder: Ladder | None) -> str:
         """What stands in the way of an answer."""
         search, most = self.search, f"{self.search.most:,} steps"
+        unstable = search.bound * search.most < 2 * search.interval
+        if search.patience.over and not unstable:
+            return f"patience={search.patience.seconds:g} s was over before an answer was known{self.last_errors()}"
         if ladder is not None:
             return (
                 f"the error of {self.name} does not fall evenly with dt (f may jump), and no run of up to {most} "
                 f"met the target"
             )
-        if search.bound * search.most < 2 * search.interval:
+        if unstable:
             return f"{self.needs()}, more than the longest pilot run, {most}, can check"
         if search.bound * search.most < 16 * search.interval:
             return f"{self.needs()}, and no pilot run of up to {most} met the target"
-        return f"within {most} the error of {self.name} did not begin to fall with its order, so no dt can be predicted"
+        return (
+            f"no run of up to {most} is known to meet the target, and the errors of {self.name} there do not follow "
+            f"its order, {search.order}, by which dt could be predicted{self.last_errors()}"
+        )
+
+    def last_errors(self) -> str:
+        """What the longest two runs of the ladder were off by, where that is known."""
+        known, seen = self.search.reference, list(self.search.seen.items())[-2:]
+        if known is None or not seen:
+            return ""
+        target = self.search.error * self.search.scale(known.final)
+        errors = {n: distance(end, known.final) / target for n, end in seen}
+        words = [f"{e:.3g} times the target" if math.isfinite(e) else "not finite" for e in errors.values()]
+        return f": with {' and '.join(f'{n:,}' for n in errors)} steps the error is {' and '.join(words)}"
 
     def remedy(self) -> str:
         """What meets the target instead: an adaptive run that was made."""
         if self.search.reference is None:
-            return "; no adaptive run is known to meet it either; raise max_pilot_steps, or take a shorter interval"
+            more = "patience" if self.search.patience.over else "max_pilot_steps"
+            return f"; no adaptive run is known to meet it either; raise {more}, or take a shorter interval"
         words = f"; use {self.search.reference.words}, whose run is known to meet the target"
         fewer = self.search.implicit_steps(self.search.reference.final, 4096) if is_explicit(self.search.step) else None
         return words + (f", or {fewer:,} step{'s' * (fewer > 1)} of linearly_implicit_euler_step" if fewer else "")
@@ -262,7 +285,7 @@ class _Answer:
         if total > 1.25 * search.error:
             return self.refusal(
                 f"roundoff: in {search.dtype} {self.name} does not get below an error of about "
-                f"{self.floor:.1e}, above the target {search.error:.1e}; use {' or '.join(self.cures(ladder.best))}",
+                f"{self.floor:.1e}, above the target {search.error:.1e}; {self.cures(num_steps, ladder.best)}",
                 self.floor,
             )
         return self.advised(num_steps, total, how(), ladder.best)
@@ -352,15 +375,24 @@ class _Answer:
             return f"oscillations that {self.name} makes grow ask for {need}"
         return f"stability alone asks for {need}"
 
-    def cures(self, final: Any) -> list[str]:
-        """What takes roundoff further down; RK4 steps where a run in this precision meets the target."""
-        search = self.search
-        if search.error < np.finfo(search.dtype).eps / 4:  # below the spacing of numbers
-            return ["float64"] if search.dtype == np.float32 else ["a larger target"]
-        cures = [] if search.compensated or not hasattr(search.step, "increment") else ["compensated=True"]
-        cures += ["float64"] if search.dtype == np.float32 else []
-        cures += ["rk4_step"] if search.order < 4 and search.steps_of(rk4_step, final, ROUGHLY, search.dtype) else []
-        return cures or ["a larger target"]
+    def cures(self, num_steps: int, final: Any) -> str:
+        """What takes roundoff further down: what a run shows to meet the target, or else what was not run."""
+        search, ways = self.search, {}
+        spaced = search.error < np.finfo(search.dtype).eps / 4  # the target is below the spacing of numbers
+        if hasattr(search.step, "increment") and not (search.compensated or spaced):
+            ways["compensated=True"] = search.dtype, True
+        if search.dtype == np.float32:
+            ways["float64"] = np.float64, search.compensated
+        able = num_steps <= search.most and not search.patience.over
+        met = [name for name, way in ways.items() if able and search.meets(num_steps, final, *way)]
+        cures = [f"{' or '.join(met)} with {num_steps:,} steps"] if met else []
+        if search.order < 4 and not spaced and (fewer := search.steps_of(rk4_step, final, ROUGHLY, search.dtype)):
+            cures.append(f"rk4_step with {fewer:,} step{'s' * (fewer > 1)}")
+        if cures:
+            return f"use {', or '.join(cures)}, as runs show"
+        if ways and not able:
+            return f"{' or '.join(ways)} may do: no run of {num_steps:,} steps was made"
+        return "use a larger target"
 
     def refusal(self, reason: str, reachable: float = math.nan) -> StepAdvice:
         return StepAdvice(math.nan, 0, reachable, self.search.stability, self.floor, False, reason)

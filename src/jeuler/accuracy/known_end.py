@@ -49,7 +49,10 @@ class Reference:
 
 
 def find_reference(
-    problem: tuple[Any, ...], max_steps: int, tolerance: Callable[[np.ndarray | None], float]
+    problem: tuple[Any, ...],
+    max_steps: int,
+    tolerance: Callable[[np.ndarray | None], float],
+    over: Callable[[], bool],
 ) -> tuple[Reference | None, bool]:
     """An adaptive run, explicit or else linearly implicit, if two tolerances agree to ``tolerance(end)``, or None.
 
@@ -59,6 +62,7 @@ def find_reference(
     Args:
       problem: (f, y0, t0, t1, args, breaks).
       tolerance: of an end; of None, of one that vanishes.
+      over: whether no further run is to be begun.
     Returns: the run, and whether some came to different ends.
     """
     f, y0, t0, t1, args, breaks = problem
@@ -76,6 +80,8 @@ def find_reference(
             )
             known: Any = None  # the run before
             for count, rtol in enumerate((*RTOL, *DECAYING * RTOL[-1:]), start=1):
+                if over():
+                    break
                 made = run(y0, t0, times, rtol, size)
                 finite = bool(np.all(np.isfinite(flat_rows(made.y)[-1])))
                 before, known = known, made if finite else known

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +46,20 @@ FOLLOWS = 0.05  # part of an error by which the end of a run may miss that of th
 TINY = 1e-290  # a final state below this has no scale of its own
 
 
+class Patience:
+    """Seconds after which no further run is begun."""
+
+    seconds: float
+    begun: float
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds, self.begun = seconds, time.perf_counter()
+
+    @property
+    def over(self) -> bool:
+        return time.perf_counter() - self.begun > self.seconds
+
+
 class Search:
     """Pilot runs of one step on one problem, looking for the fewest steps whose error meets the target."""
 
@@ -60,6 +75,8 @@ class Search:
     planned: int  # steps of the longest pilot run
     ceiling: int  # of one where stability asks for so many
     breaks: tuple[float, ...]
+    patience: Patience
+    seen: dict[int, np.ndarray]  # the ends of the runs of the ladder
     disagreeing: bool  # whether adaptive runs came to different ends
     vanishing: bool  # whether the end is 0 but for roundoff, so that no error is relative to it
     interval: float
@@ -83,9 +100,11 @@ class Search:
         relative: bool,
         compensated: bool,
         most: int,
+        patience: Patience,
         ceiling: int = 0,
         breaks: tuple[float, ...] = (),
     ) -> None:
+        self.patience, self.seen = patience, {}
         self.f, self.start, self.t0, self.t1, self.args, self.step = f, y0, t0, t1, args, step
         self.error, self.relative, self.compensated = error, relative, compensated
         self.planned, self.ceiling = most, max(most, ceiling)
@@ -153,15 +172,19 @@ class Search:
     def climb(self, num_steps: int, ladder: Ladder | None = None) -> Ladder | None:
         """Double the steps until the finest run's error is known, and meets the target or follows the order."""
         ladder, looked = Ladder(self.order) if ladder is None else ladder, False
-        while num_steps <= self.most or (num_steps <= self.ceiling and self._falling(ladder)):
+        while not self.patience.over and (
+            num_steps <= self.most or (num_steps <= self.ceiling and self._falling(ladder))
+        ):
             states = self.pilot(num_steps)
+            self.seen[num_steps] = states[-1]
             ladder.add(num_steps, states[-1])
             if len(ladder.finals) >= 4 and self._trusted(ladder):
                 if not looked:
                     looked = True
                     times = self.t0 + self.interval * np.arange(1, len(states) + 1) / len(states)
                     self.look_at_stability(states[::2], times[::2])
-                far = self._regular(ladder) and self.predicted(ladder)[0] > self.most // NEAR_ENOUGH
+                own_run = 0 if self.patience.over else self.most // NEAR_ENOUGH
+                far = self._regular(ladder) and self.predicted(ladder)[0] > own_run
                 if ladder.errors()[-1] <= self.target(ladder) or far:
                     return ladder
             num_steps *= 2
@@ -227,6 +250,7 @@ class Search:
             error_high < NEAR * aim
             and high - low > max(1, FINENESS * high)
             and spent < max(8 * self.planned, 2 * self.most)
+            and not self.patience.over
         ):
             part = 0.5
             if math.isfinite(error_low):  # log-log interpolation, kept off the ends
@@ -266,7 +290,8 @@ class Search:
         tolerance, most = TRUST * self.error, max(256, self.planned // 8)
         problem = self.f, self.start, self.t0, self.t1, self.args, self.breaks
         scale = lambda end: 1.0 if end is None else self.scale(end)  # noqa: E731
-        known, self.disagreeing = find_reference(problem, most, lambda end: tolerance * scale(end))
+        over = lambda: self.patience.over  # noqa: E731
+        known, self.disagreeing = find_reference(problem, most, lambda end: tolerance * scale(end), over)
         self.vanishing = known is not None and known.vanishes
         return known
 
@@ -276,25 +301,25 @@ class Search:
         The error is that of the modified equation, which the step follows but for terms of one order more. It is
         believed where a pilot run ends where that equation does: within a twentieth of the error there.
         """
-        if self.order > LARGEST_ORDER or self.breaks:
+        if self.order > LARGEST_ORDER or self.breaks or self.patience.over:
             return None
         aim, seen = AIM * self.error * self.scale(known.final), self.most
         with double_precision():
             ends = LeadingError(self.f, self.start, self.t0, self.t1, self.args, self.step, known.step)
             exact = ends(0.0)
             error_of = lambda n: distance(ends(self.interval / n), exact)  # noqa: E731
-            if not distance(exact, known.final) <= TRUST * aim:
+            if not distance(exact, known.final) <= TRUST * aim or self.patience.over:
                 return None
             while not distance(self.pilot(seen)[-1], ends(self.interval / seen)) <= FOLLOWS * error_of(seen):
                 seen *= 2
-                if seen > self.ceiling:
+                if seen > self.ceiling or self.patience.over:
                     return None
             num_steps = seen
             for _ in range(8):
                 error = error_of(num_steps)
                 if NEAR * aim <= error <= aim:
                     return num_steps, error, seen
-                if not np.isfinite(error):
+                if not np.isfinite(error) or self.patience.over:
                     return None
                 num_steps = math.ceil(num_steps * (error / (0.95 * aim)) ** (1 / self.order))
         return None
@@ -314,7 +339,8 @@ class Search:
         beside = lambda n: max(error_of(max(1, round(n * part))) for part in BESIDE)  # noqa: E731
         meets = lambda n: error_of(n) <= AIM and beside(n) <= FACTOR  # noqa: E731
         least, accident, spent, found = num_steps, 0, 0, 0
-        while not found and num_steps <= min(self.most, accident or self.most) and spent <= 3 * self.most:
+        longest = lambda: self.most if not self.patience.over else 0  # noqa: E731
+        while not found and num_steps <= min(longest(), accident or self.most) and spent <= 3 * self.most:
             if meets(num_steps):
                 if error_of(num_steps) >= 1 / FACTOR or beside(num_steps) <= 1 / FACTOR:
                     found = num_steps
@@ -329,14 +355,14 @@ class Search:
             found = self.on_edge(error_of, found)
         elif error_of(found) < 1 / FACTOR and not many:
             counts = np.linspace(max(least, found / 2), found * FINER, int(np.clip(self.most // found, *BETWEEN)))
-            do = [n for n in map(math.ceil, counts) if meets(n)]
+            do = [n for n in map(math.ceil, counts) if not self.patience.over and meets(n)]
             found = next((n for n in do if error_of(n) >= 1 / FACTOR), min([*do, found]))
         return found, error_of(found) * self.error * self.scale(final)
 
     def on_edge(self, error_of: Callable[[int], float], high: int) -> int:
         """The fewest steps, to a hundredth, that meet the aim and are stable, as they are with dt 1 % larger."""
         low = round(high / FINER)
-        while high - low > max(1, EDGE * high):
+        while high - low > max(1, EDGE * high) and not self.patience.over:
             middle = (low + high) // 2
             if error_of(middle) <= AIM and error_of(math.ceil(middle * (1 - MARGIN))) <= FACTOR:
                 high = middle
@@ -349,6 +375,11 @@ class Search:
         error = distance(self.pilot(num_steps)[-1], final) / self.scale(final) / self.error
         return error if math.isfinite(error) else math.inf
 
+    def meets(self, num_steps: int, final: np.ndarray, dtype: Any, compensated: bool) -> bool:
+        """Whether a run of the step in this precision meets the target."""
+        end = self.runs(self.step, dtype, compensated)(num_steps)[-1]
+        return distance(end, final) <= self.error * self.scale(final)
+
     def implicit_steps(self, final: np.ndarray, fewer_than: int) -> int | None:
         """How many linearly implicit Euler steps meet the aim, a power of two, found by runs; None if not that few."""
         return self.steps_of(linearly_implicit_euler_step, final, min(fewer_than, self.planned // 64))
@@ -357,7 +388,7 @@ class Search:
         """How many of these steps meet the aim, a power of two, found by runs; None if not so few."""
         run, aim = self.runs(step, dtype, False), AIM * self.error * self.scale(final)
         num_steps, met = 1, False
-        while num_steps < fewer_than:
+        while num_steps < fewer_than and not self.patience.over:
             before, met = met, distance(run(num_steps)[-1], final) <= aim
             if before and met:  # twice running: no accident
                 return num_steps // 2
