@@ -66,9 +66,11 @@ def test_returns_the_best_seen_not_the_last():
     found = jeuler.fit(lambda p: p, jnp.array([3.0]), optimizer=optax.sgd(0.95), max_iterations=30)
     assert found.loss == found.history.min()
     np.testing.assert_allclose(found.params**2, found.loss)
-    wild = jeuler.fit(lambda p: p, jnp.array([3.0]), optimizer=optax.sgd(1.2), max_iterations=30)
+    wild = jeuler.fit(lambda p: p, jnp.array([3.0]), optimizer=optax.sgd(1.2), max_iterations=60)
     assert wild.history[-1] > wild.history[0]
     np.testing.assert_allclose(wild.params, 3.0)
+    assert not wild.converged  # the loss stood still, at its start
+    assert "this is no minimum" in wild.message
 
 
 @pytest.mark.parametrize("optimizer", [None, optax.adam(0.5), optax.sgd(50.0)], ids=["lm", "adam", "sgd"])

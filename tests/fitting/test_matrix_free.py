@@ -57,6 +57,26 @@ def test_agrees_with_the_fit_that_forms_it(loss, bounds, start, without_a_jacobi
     assert found.at_bound == formed.at_bound
 
 
+def largest(jaxpr):
+    """The most numbers that one array in a program has, programs within it included."""
+    inner = [
+        p for e in jaxpr.eqns for p in jax.tree.leaves(list(e.params.values()), is_leaf=lambda p: hasattr(p, "eqns"))
+    ]
+    inner = [getattr(p, "jaxpr", p) for p in inner if hasattr(p, "eqns")]
+    own = [np.prod(v.aval.shape) for e in jaxpr.eqns for v in e.outvars if hasattr(v.aval, "shape")]
+    return max([*own, *map(largest, inner)], default=0)
+
+
+def test_a_step_and_its_cost_form_no_jacobian():
+    """60 unknowns and 1,800 residuals: a Jacobian has 108,000 numbers, eight probes of its columns 16,200."""
+    x = {"a": np.full(30, 1.5), "k": np.ones(30)}
+    problem = problems.Problem.of(residual, x, data=np.ones((60, 30)))
+    task, own = problem.task(1e-4), matrix_free.products(problem.residual, "soft_l1")
+    at, zero = jnp.asarray(problem.x), jnp.asarray(0.1)
+    programs = [jax.make_jaxpr(own.cost)(at, task), jax.make_jaxpr(own.step)(at, task, zero, zero, zero)]
+    assert 1800 <= max(largest(program.jaxpr) for program in programs) <= 16_200
+
+
 def test_far_from_the_minimum_it_does_not_say_converged(without_a_jacobian):
     without_a_jacobian()
     found = jeuler.fit(residual, {"a": np.ones(6), "k": np.full(6, 3.0)}, data=data(), max_iterations=2)

@@ -93,6 +93,10 @@ def test_the_bias_of_the_step_is_reported(step, dt, biased):
     for name in ("ks", "kd"):
         moved = float(found.params[name] - better.params[name])
         np.testing.assert_allclose(found.step_bias[name], moved, rtol=0.35, atol=0.1 * float(better.stderr[name]))
+    advised = re.search(r"use dt = ([0-9.e-]+)", found.message)
+    if step is jeuler.rk4_step and biased:  # a step of first order would need millions of steps
+        there = jeuler.fit_springs(scene(), STATE, T, seen(), dt=float(advised[1]), step=step)
+        assert "use dt" not in there.message
 
 
 def test_two_gliders_reach_the_minimum_with_damping_at_zero():
@@ -195,6 +199,12 @@ def test_bad_input_of_fit_springs(name):
         ({"positions": seen(SWING - 1)}, "begin 1 m from where the state is.*from one origin"),
         ({"scene": jeuler.Scene((jeuler.Springs([[0, 1]], 80.0, 0.2, 1000.0),))}, "rest_length is 1e\\+03 m where the"),
         ({"bounds": {"ks": (0.0, 90.0)}}, "ks ended on a bound"),
+        (
+            {"parameters": ("ks",)},
+            "the residual is .* times the noise in the data: a wrong minimum, or the model lacks",
+        ),
+        ({"parameters": ("ks",), "sigma": 1e-3}, "the residual is .* times sigma: a wrong minimum"),
+        ({"sigma": 1e-2}, "the residual is only 0.097 times sigma: sigma is too large"),
         ({"times": T[:3], "positions": seen()[:3]}, "do not determine|not told apart|there are only"),
         ({"times": T[[7, 20]], "positions": seen()[[7, 20]]}, "only 2 data for 2 parameters: no errors without sigma"),
         ({"scene": scene(edges=[[0, 1], [1, 0]], ks=[40.0, 40.0])}, r"ks\[0\] and ks\[1\] only as their sum"),

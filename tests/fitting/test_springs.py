@@ -133,6 +133,32 @@ def test_times_off_the_grid_and_missing_cells(random):
     np.testing.assert_allclose((found.ks, found.kd), (KS, KD), rtol=1e-4)
 
 
+def test_each_observation_has_its_own_sigma_or_weight(random):
+    """An outlier of 10 m that is NaN, of sigma inf or of weight 0; elsewhere sigma is absolute and weights relative."""
+    noise = np.where(np.arange(len(TIMES)) % 2, 1e-3, 5e-3)
+    y = observed()
+    y[:, 1, 0] += noise * random.normal(size=len(TIMES))
+    scene, state = single(ks=7.0)
+    spoilt, sigma = y.copy(), np.broadcast_to(noise[:, None, None], y.shape).copy()
+    y[9], spoilt[9, 1], sigma[9] = np.nan, 10.0, np.inf
+    found = [
+        jeuler.fit_springs(scene, state, TIMES, positions, dt=0.02, **options)
+        for positions, options in (
+            (y, {"sigma": noise[:, None, None]}),
+            (spoilt, {"sigma": sigma}),
+            (spoilt, {"weights": 4e-6 / sigma**2}),
+        )
+    ]
+    for name, truth in (("ks", KS), ("kd", KD)):
+        by_sigma, by_inf, by_weight = (each.params[name] for each in found)
+        np.testing.assert_allclose([by_inf, by_weight], by_sigma, rtol=1e-6)
+        assert abs(by_sigma - truth) < 4 * found[0].stderr_white[name]
+        scaled = found[0].stderr_white[name] * found[0].noise_ratio
+        np.testing.assert_allclose(found[2].stderr_white[name], scaled, rtol=1e-4)
+    equal = jeuler.fit_springs(scene, state, TIMES, y, dt=0.02)
+    assert equal.stderr_white["ks"] > 1.5 * found[2].stderr_white["ks"]
+
+
 def test_gradient_descent_by_optax():
     scene, state = single(ks=6.0, kd=0.8)
     adam = {"optimizer": optax.adam(0.05), "max_iterations": 300}
@@ -211,10 +237,21 @@ def test_bad_input(change, message):
         jeuler.fit_springs(scene, state, **arguments)
 
 
-@pytest.mark.parametrize("start", [{"kd": 0.0}, {"kd": 1e-9}, {"ks": 0.0}, {"ks": 0.0, "kd": 0.0}, {"ks": 900.0}])
-def test_zero_and_far_starts_are_legal(start):
-    scene, state = single(**start)
-    found = jeuler.fit_springs(scene, state, TIMES, observed(), dt=0.02)
+@pytest.mark.parametrize(
+    ("start", "values"),
+    [
+        ("data", {"kd": 0.0}),
+        ("data", {"ks": 0.0}),
+        ("data", {"ks": 0.0, "kd": 0.0}),
+        ("data", {"ks": 900.0}),
+        ("given", {"kd": 0.0}),
+        ("given", {"kd": 1e-6}),
+        ("given", {"ks": 0.0, "kd": 1e-9}),
+    ],
+)
+def test_zero_and_far_starts_are_legal(start, values):
+    scene, state = single(**values)
+    found = jeuler.fit_springs(scene, state, TIMES, observed(), dt=0.02, start=start)
     np.testing.assert_allclose((found.ks, found.kd), (KS, KD), rtol=1e-4)
     assert found.converged
 

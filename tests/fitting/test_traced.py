@@ -92,3 +92,18 @@ def test_fits_are_members_of_an_ensemble_and_go_on_from_its_folder(tmp_path):
         np.testing.assert_allclose(together.mean[name], values.mean(), rtol=1e-6)
         np.testing.assert_allclose(together.variance[name], values.var(ddof=1), rtol=1e-4)
     assert together.mean["converged"] == 1.0
+
+
+def test_a_bootstrap_of_a_thousand_records_is_one_call_and_spreads_as_the_errors_of_one_fit():
+    records = 0.05 * jax.random.normal(jax.random.key(1), (1000, 21))
+
+    def best(noise):
+        found = of_a_curve(noise)
+        return found.params, found.stderr_white, found.converged
+
+    params, errors, converged = jax.jit(jax.vmap(best))(records)
+    assert converged.all()
+    for name, truth in (("ks", 2.0), ("kd", 1.3)):
+        spread = np.std(params[name])
+        np.testing.assert_allclose(spread, np.mean(errors[name]), rtol=0.1)
+        assert abs(np.mean(params[name]) - truth) < 0.15 * spread

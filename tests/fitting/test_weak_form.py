@@ -1,5 +1,6 @@
 """A start from the data alone: meshes, drags, gravity, shared and tied parameters, and fits that need no guess."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -42,8 +43,11 @@ def test_every_spring_of_a_mesh_from_its_tracks_alone(random):
     assert fitted.start == "data"
     assert fitted.converged
     assert 0.7 < fitted.noise_ratio < 1.3
-    z = np.concatenate([(fitted.params[n] - truth) / fitted.stderr[n] for n, truth in (("ks", ks), ("kd", kd))])
-    assert np.sqrt(np.mean(z**2)) < 1.5
+    far = jeuler.Scene((jeuler.Springs(edges, 1.5 * ks, 1.5 * kd, length),))
+    given = jeuler.fit_springs(far, state, times, y, dt=0.01, start="given")
+    for found in (fitted, given):
+        z = np.concatenate([(found.params[n] - truth) / found.stderr[n] for n, truth in (("ks", ks), ("kd", kd))])
+        assert np.sqrt(np.mean(z**2)) < 1.5
 
 
 def test_what_enters_linearly_beside_springs(random):
@@ -86,8 +90,38 @@ def test_what_does_not_enter_linearly_or_was_not_seen_stays(random):
     assert abs(found["ks"][0] - 30.0) < 1
     assert found["ks"][2] == 3.0
     assert found["mass"].tolist() == [1.0] * 4
+    twice = jeuler.Scene((jeuler.Springs([*edges[:2], edges[0]], [1.0, 2.0, 3.0], 0.1, 1.0),))
+    places_twice = Places.of(state, ("ks",), None)
+    values = weak_form(twice, state, times, y, places_twice, places_twice.read(twice, state)).singular_values
+    assert values[-1] < 1e-7 * values[-2]  # only the sum of the two is seen
     few = weak_form(guess, state, times[:6], y[:6], places, places.read(guess, state))
     assert few is None
+
+
+class Own(eqx.Module):
+    """-cubic s^3 - share drag tanh(v / width): affine in cubic and drag, in share by itself alone, not in width."""
+
+    cubic: float
+    drag: float
+    share: float
+    width: float
+
+    def __call__(self, t, position, velocity, mass):
+        pull = -self.cubic * (position - 1.0) ** 3 - self.share * self.drag * jnp.tanh(velocity / self.width)
+        return pull.at[0].set(0.0)
+
+
+def test_a_force_of_ones_own_gives_what_enters_it_linearly(random):
+    x, v, mass = np.array([[0.0], [1.8]]), np.zeros((2, 1)), np.array([np.inf, 1.0])
+    spring, times = jeuler.Springs([[0, 1]], 20.0, 0.0, 1.0), np.linspace(0, 4, 161)
+    y = recorded(jeuler.Scene((spring, Own(15.0, 0.5, 1.0, 0.8))), x, v, mass, times, random)
+    guess = jeuler.Scene((jeuler.Springs([[0, 1]], 1.0, 0.0, 1.0), Own(0.0, 0.1, 1.0, 0.8)))
+    state, names = jeuler.ParticleState(x, v, mass), ("ks", "cubic", "drag", "share", "width")
+    places = Places.of(state, names, None)
+    found = weak_form(guess, state, times, y, places, places.read(guess, state)).params
+    np.testing.assert_allclose([found["ks"], found["cubic"]], [20.0, 15.0], rtol=0.03)
+    np.testing.assert_allclose(found["drag"], 0.5, rtol=0.1)
+    assert (found["share"], found["width"]) == (1.0, 0.8)
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.1, 1.0, 10.0, 100.0])

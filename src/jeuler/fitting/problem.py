@@ -247,5 +247,8 @@ def _stage(form: Layout, stage: PyTree, weight: Any) -> Any:
     values = form.spread("each of stages", stage, 1.0) if isinstance(stage, (dict, list, tuple)) else stage
     if np.size(values) != form.size:
         raise ValueError(f"each of stages must have one weight a residual, {form.size}, got {np.size(values)}")
-    xp: Any = jnp if any(map(checks.is_traced, (values, weight))) else np
-    return weight * xp.sqrt(xp.maximum(xp.ravel(xp.asarray(values)), 0))
+    traced = any(map(checks.is_traced, (values, weight)))
+    if not traced and not np.all(np.asarray(values) >= 0):
+        raise ValueError("each of stages must be weights of 0 or more (0 leaves a residual out), got one that is not")
+    xp: Any = jnp if traced else np
+    return weight * xp.sqrt(xp.ravel(xp.asarray(values)))

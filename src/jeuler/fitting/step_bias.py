@@ -108,8 +108,11 @@ def bias_of_many(task: Recorded, found: Fit, asked: Asked) -> tuple[Any, list[st
 
 
 def _advised(dt: float, share: float, order: int) -> float:
-    """The dt at which the bias is a tenth of a standard error, rounded down to two digits."""
-    advised = dt * min((TENTH / share) ** (1 / order), 0.5)
+    """The dt at which the bias is well below a tenth of a standard error, rounded down to two digits.
+
+    By its order it would be half of that there; a coarse dt does not show its order quite.
+    """
+    advised = dt * min((TENTH / 2 / share) ** (1 / order), 0.5)
     unit = 10 ** (np.floor(np.log10(advised)) - 1)
     return float(np.floor(advised / unit) * unit)
 

@@ -273,16 +273,17 @@ def _terms_of(rows: Rows, force: Any, k: int, scene: Scene, places: Places) -> t
         return rows.of_particles(here), []
     by_theta = jax.jit(jax.vmap(jax.jacfwd(at), in_axes=(None, 0, 0, 0)))
     slope = np.asarray(by_theta(jnp.asarray(theta), t, x, v), float)  # (fine, particle, dim, number)
-    known, terms, start = here.copy(), [], 0
+    known, terms, start, moved = here.copy(), [], 0, theta
     for field, size in zip(names, sizes, strict=True):
         own = slice(start, start + size)
-        moved = theta.copy()
-        moved[own] = 2 * theta[own] + 1
-        there = np.asarray(everywhere(jnp.asarray(moved), t, x, v), float)
-        expected = here + slope[..., own] @ (moved - theta)[own]
+        tried = moved.copy()
+        tried[own] = 2 * theta[own] + 1
+        there = np.asarray(everywhere(jnp.asarray(tried), t, x, v), float)
+        expected = here + slope @ (tried - theta)
         start += size
         if not np.allclose(there, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max(initial=0)):
-            continue  # not affine: it stays at its start
+            continue  # not affine, or not together with those before it: it stays at its start
+        moved = tried
         known = known - slope[..., own] @ theta[own]
         columns = np.stack([rows.of_particles(slope[..., c]) for c in range(own.start, own.stop)], axis=1)
         positive = places.positive(scene)[free[field]]
