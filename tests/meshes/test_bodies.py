@@ -22,6 +22,9 @@ def outward(triangles):
     return np.where(turned[:, None], triangles[:, ::-1], triangles)
 
 
+SOLIDS = (jeuler.mesh_collider((CORNERS, outward(CUBE)), spacing=0.1), jeuler.Box([0.5, 0.5, 0.5], 0.5))
+
+
 def hills():
     """A hilly sheet of 4 x 5 points, one point of no cell among them."""
     cloth = jeuler.grid_cloth((4, 5), (3.0, 4.0), density=1.0, ks=1.0)
@@ -84,8 +87,7 @@ def test_a_cloth_and_a_rope_have_their_masses_and_bend():
 
 def test_a_mesh_to_collide_with_has_the_distance_of_its_solid():
     """A cube against the formula, within, beside and beyond its grid; and how the distance grows."""
-    solid = jeuler.mesh_collider((CORNERS, outward(CUBE)), spacing=0.1)
-    truth = jeuler.Box([0.5, 0.5, 0.5], 0.5)
+    solid, truth = SOLIDS
     points = jnp.asarray(np.random.default_rng(0).uniform(-0.15, 1.15, (200, 3)))
     found, slope = jax.jit(jax.vmap(jax.value_and_grad(solid, argnums=1), (None, 0)))(0.0, points)
     right, along = jax.jit(jax.vmap(jax.value_and_grad(truth, argnums=1), (None, 0)))(0.0, points)
@@ -98,6 +100,19 @@ def test_a_mesh_to_collide_with_has_the_distance_of_its_solid():
         assert 0 < d <= float(truth(0.0, jnp.array(far))) + 1e-12
     away = jax.grad(lambda h: solid(0.0, jnp.array([0.5, 0.5, 1.05 + h])))(0.0)
     np.testing.assert_allclose(away, 1, rtol=1e-9)
+
+
+def test_a_ball_bounces_off_a_mesh_and_slides_on_it_as_on_the_formula_of_its_solid():
+    def run(solid):
+        bounce = jeuler.Collisions((solid,), radius=0.1, restitution=0.5, friction=0.1)
+        scene = jeuler.Scene((jeuler.Gravity([0.0, 0.0, -9.81]),), (bounce,))
+        ball = jeuler.ParticleState([[0.4, 0.5, 1.4]], [[0.3, 0.0, 0.0]])
+        return jeuler.simulate(scene, ball, dt=0.05, num_steps=16).y.position[:, 0]
+
+    on_mesh, on_box = map(run, SOLIDS)
+    np.testing.assert_allclose(on_mesh, on_box, atol=1e-9)
+    assert 1.1 - 1e-9 < on_mesh[:, 2].min() < 1.101
+    assert on_mesh[-1, 0] > 0.45
 
 
 @pytest.mark.parametrize(
