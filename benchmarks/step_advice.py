@@ -1,6 +1,7 @@
 """advise_step over its steps, problems, spring scenes and switched fields: achieved error against target.
 
     python benchmarks/step_advice.py [all | problems | scenes | switched] [--log FILE] [--part NAME] [--steps euler rk4]
+        [--targets 1e-2] [--patience SECONDS]
 
 Each answer is printed as it comes. With --log FILE it is kept there too, as one line of JSON, and a run that was cut
 off goes on after the last of them.
@@ -98,13 +99,14 @@ def false_refusal(advice, runs, target, longest):
     return ""
 
 
-def check(part, title, problem, args, step_name, target):
+def check(part, title, problem, args, step_name, target, patience):
     """One answer, as a dictionary."""
     step = STEPS[step_name]
     runs = Runs(problem, args, step)
     linear = Runs(problem, args, jeuler.linearly_implicit_euler_step)
     begun = time.process_time()
-    advice = jeuler.advise_step(problem.f, problem.y0, t0=problem.t0, t1=problem.t1, args=args, error=target, step=step)
+    asked = {"t0": problem.t0, "t1": problem.t1, "args": args, "error": target}
+    advice = jeuler.advise_step(problem.f, problem.y0, **asked, step=step, patience=patience)
     seconds = time.process_time() - begun
     explicit = hasattr(getattr(step, "base", step), "increment")
     longest = (LONGEST if explicit else LONGEST_IMPLICIT) / np.size(problem.reference)
@@ -182,6 +184,7 @@ def main():
     parser.add_argument("--part", default="", help="only those with this in their name; several by commas")
     parser.add_argument("--steps", nargs="+", choices=list(STEPS), default=None)
     parser.add_argument("--targets", type=float, nargs="+", default=[1e-2, 1e-4])
+    parser.add_argument("--patience", type=float, default=120.0, help="seconds, of each answer")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     log, known = given.log, {}
@@ -197,7 +200,7 @@ def main():
                 for target in given.targets:
                     answer = known.get((part, name, step_name, target))
                     if answer is None:
-                        answer = check(part, name, problem, args, step_name, target)
+                        answer = check(part, name, problem, args, step_name, target, given.patience)
                         if log is not None:
                             with log.open("a") as file:
                                 print(json.dumps(answer), file=file)

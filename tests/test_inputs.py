@@ -211,7 +211,16 @@ def test_a_clock_that_stands_still_is_announced():
 
 
 @pytest.mark.parametrize(
-    "step", [jeuler.euler_step, jeuler.rk4_step, jeuler.implicit_euler_step, jeuler.linearly_implicit_euler_step]
+    "step",
+    [
+        jeuler.euler_step,
+        jeuler.heun_step,
+        jeuler.rk4_step,
+        jeuler.extrapolated_euler(4),
+        jeuler.implicit_euler_step,
+        jeuler.linearly_implicit_euler_step,
+        jeuler.implicit_midpoint_step,
+    ],
 )
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_backwards_in_time_eagerly_as_under_jit(step, dtype):
@@ -227,6 +236,17 @@ def test_backwards_in_time_eagerly_as_under_jit(step, dtype):
     np.testing.assert_allclose(jax.jit(back)(-1e-3).y, eager.y, rtol=1e-6)
 
 
+def test_a_run_that_ends_where_it_begins_stays_there():
+    run = jeuler.solve_adaptive(decay, 2.0, t0=0.7, t1=0.7)
+    assert run.finished
+    np.testing.assert_array_equal(run.y, 2.0)
+    np.testing.assert_allclose(run.t, 0.7)
+    traced = jax.jit(lambda t1: jeuler.solve_adaptive(decay, 2.0, t0=0.7, t1=t1).y)
+    np.testing.assert_array_equal(traced(0.7), 2.0)
+    assert np.isnan(traced(0.6)[-1]), "backwards goes solve: refused where t1 is known, NaN where it is traced"
+    assert jeuler.solve(decay, 2.0, t0=0.7, dt=0.1, num_steps=0).y.tolist() == [2.0]
+
+
 @pytest.mark.parametrize(
     "effect", [Collisions((FLOOR,)), jeuler.Lifetime(1.0), jeuler.SpeedLimit(1.0), DeathOutside(-1.0, 1.0)]
 )
@@ -239,9 +259,10 @@ def test_what_cannot_be_undone_refuses_to_run_backwards(effect):
     assert np.isfinite(traced(0.01)).all()
 
 
-def test_a_scene_runs_backwards_to_where_it_came_from():
+@pytest.mark.parametrize(("step", "near"), [(jeuler.rk4_step, 1e-7), (jeuler.symplectic_euler_step, 0.05)])
+def test_a_scene_runs_backwards_to_where_it_came_from(step, near):
     state = ParticleState([[0.0, 0.0], [1.2, 0.0]], jnp.zeros((2, 2)), mass=[jnp.inf, 0.5])
-    there = simulate(NET, state, num_steps=100, step=jeuler.rk4_step).y
+    there = simulate(NET, state, num_steps=100, step=step).y
     end = state.replace(position=there.position[-1], velocity=there.velocity[-1])
-    back = simulate(NET, end, num_steps=100, dt=-0.01, t0=1.0, step=jeuler.rk4_step).y
-    np.testing.assert_allclose(back.position[-1], state.position, atol=1e-7)
+    back = simulate(NET, end, num_steps=100, dt=-0.01, t0=1.0, step=step).y
+    np.testing.assert_allclose(back.position[-1], state.position, atol=near)

@@ -128,7 +128,7 @@ import jax, jeuler, sys, time
 scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks=1.0, kd=0.0, rest_length=1.0),))
 state = jeuler.ParticleState([[0.0, 0.0], [1.5, 0.0]], [[0.0, 0.0], [0.0, 0.0]])
 how = {"dt": 1e-3, "num_steps": 2**31 + 2**24, "save_every": 2**24}
-how["progress"] = {"bar": True, "none": None}[sys.argv[2]]
+how["progress"] = {"bar": True, "callback": lambda step, num_steps: None, "none": None}[sys.argv[2]]
 print("begun", flush=True)
 try:
     if sys.argv[1] == "solve":
@@ -140,7 +140,7 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize(("what", "progress"), [("solve", "none"), ("simulate", "bar")])
+@pytest.mark.parametrize(("what", "progress"), [("solve", "none"), ("solve", "callback"), ("simulate", "bar")])
 def test_ctrl_c_stops_a_long_run_within_a_second(what, progress):
     source = pathlib.Path(jeuler.__file__).parents[1]
     environment = os.environ | {"PYTHONPATH": str(source)}
