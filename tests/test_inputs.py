@@ -56,6 +56,18 @@ WRONG = {  # what a person wrote: a part of the one line that comes back
     "edges turned round": (lambda: Springs(np.zeros((2, 5), int), 1.0, 0.0, 1.0), r"turn it round, edges.T"),
     "ragged edges": (lambda: Springs([[0, 1], [1]], 1.0, 0.0, 1.0), "rows differ in length"),
     "a particle twice in a triple": (lambda: Bending([[0, 0, 1]], 1.0), r"Bending.triples\[0\] = \[0, 0, 1\]"),
+    "an edge to itself": (
+        lambda: Springs([[1, 1]], 1.0, 0.0, 1.0),
+        r"two different particles, got edges\[0\] = \[1, 1\]",
+    ),
+    "a particle moved twice": (
+        lambda: simulate(Scene(effects=(PrescribedMotion([0, 0], lambda t: jnp.zeros((2, 2))),))),
+        r"PrescribedMotion.particles must be different indices from 0 to 1, got \[0, 0\]",
+    ),
+    "a particle pushed twice": (
+        lambda: jeuler.AppliedForce([1.0, 0.0], particles=[0, 0]),
+        "AppliedForce.particles must be different particles, got 0 twice",
+    ),
     "a particle twice in a body": (lambda: ShapeMatching([0, 0], np.eye(2), 1.0), "0 twice"),
     "an index with a fraction": (
         lambda: PrescribedMotion([0.7], lambda t: t),
@@ -63,6 +75,7 @@ WRONG = {  # what a person wrote: a part of the one line that comes back
     ),
     "one strand": (lambda: jeuler.strand_edges([0, 1, 2]), r"strand_edges\(\[strand\]\)"),
     "complex stiffness": (lambda: Springs([[0, 1]], 1j, 0.0, 1.0), "Springs.ks must be a number.*real"),
+    "complex stiffnesses": (lambda: Springs([[0, 1]], np.array([1j]), 0.0, 1.0), "Springs.ks must be .*complex128"),
     "complex array": (lambda: Gravity(jnp.zeros(2, complex)), "Gravity.acceleration must be a number.*complex"),
     "a boolean stiffness": (lambda: Springs([[0, 1]], True, 0.0, 1.0), "Springs.ks .*got True"),
     "a stiffness that is not a number": (lambda: simulate(Scene((Springs([[0, 1]], np.nan, 0.0, 1.0),))), "got nan"),
@@ -75,6 +88,7 @@ WRONG = {  # what a person wrote: a part of the one line that comes back
         "normal must be .*got nan",
     ),
     "a drag that drives": (lambda: LinearDrag(-1.0), "LinearDrag.coefficient must not be negative, got -1 kg/s"),
+    "a quadratic drag that drives": (lambda: jeuler.QuadraticDrag(-1.0), "must not be negative, got -1 kg/m"),
     "negative viscosity": (lambda: Viscosity([[0, 1]], -1.0), "Viscosity.coefficient must not be negative"),
     "negative spread": (lambda: Normal(0.0, -1.0), "Normal.deviation must not be negative"),
     "negative radius": (lambda: FromDisc([0.0, 0.0], -1.0), "FromDisc.radius must not be negative, got -1 m"),
@@ -111,6 +125,12 @@ WRONG = {  # what a person wrote: a part of the one line that comes back
     "a field of the state in words": (lambda: ParticleState([[0.0]], [[0.0]], extra=[1]), "extra must be a dict"),
     "a dtype that is none": (lambda: jeuler.empty_pool(3, 2, dtype="nope"), "dtype must be a floating dtype"),
     "an end in place of a number of steps": (lambda: simulate(t1=1.0), r"write num_steps=round\(\(t1 - t0\) / dt\)"),
+    "an end for solve": (lambda: jeuler.solve(decay, 1.0, t1=1.0), r"write num_steps=round\(\(t1 - t0\) / dt\)"),
+    "dt by place in a scene": (
+        lambda: jeuler.simulate(NET, PAIR, 0.1, 10),
+        r"write simulate\(scene, state, dt=..., num_steps=...\)",
+    ),
+    "an end by place": (lambda: jeuler.solve_adaptive(decay, 1.0, 1.0), r"write solve_adaptive\(f, y0, t1=...\)"),
     "dt by place": (lambda: jeuler.solve(decay, 1.0, 0.1, 10), r"write solve\(f, y0, dt=..., num_steps=...\)"),
     "no dt": (lambda: jeuler.solve(decay, 1.0), r"solve needs dt and num_steps; write solve\(f, y0, dt=..., num"),
     "an argument misspelt": (lambda: jeuler.solve(decay, 1.0, dt=0.1, n_steps=1), "did you mean num_steps="),

@@ -108,8 +108,8 @@ class PrescribedMotion:
         `SampledPath` or ``jax.tree_util.Partial``, is differentiable in its leaves.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state with these particles on their path
       at time t.
-    Raises: ValueError, if an index is no integer or repeated, or the path is no function of t; in `simulate`, if an
-      index is out of range or the path has another shape.
+    Raises: ValueError, if an index is no integer or the path is no function of t; in `simulate`, if an index is out
+      of range or repeated, or the path has another shape.
     Example:
       >>> import jax.numpy as jnp, jeuler
       >>> hand = jeuler.PrescribedMotion([0], lambda t: jnp.stack([jnp.sin(t), 0.0 * t])[None])
