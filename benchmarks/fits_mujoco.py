@@ -2,6 +2,7 @@
 
     pip install 'mujoco[sysid]'
     python benchmarks/fits_mujoco.py [N ...] [--draws 0:5]    chains of N masses between walls, N + 1 springs; 3 20 100
+    python benchmarks/fits_mujoco.py [N ...] --sums 0:8       errors of the two sums, see below, both by jeuler
 
 Unit masses on a line, springs as spatial tendons with stiffness and damping of each, 4 s at dt = 0.01 by RK4 in both,
 positions of all masses at 401 times with noise of 1 mm, made by diffrax's Tsit5 at 1e-9. Each draw has its own springs,
@@ -11,7 +12,7 @@ at its first fit too.
 
 The two do not minimise the same sum: sysid divides the residual of each mass by the norm of its displacements, jeuler
 by one sigma for all, which is what noise of 1 mm everywhere asks for. A third fit, by jeuler with the weights of sysid,
-shows that the two end at the same minimum of the same sum.
+shows that the two end at the same minimum of the same sum, so that ``--sums`` has the errors of both without sysid.
 """
 
 import importlib
@@ -210,12 +211,35 @@ def main(counts, draws):
         print(f"  with the same weights the two differ by {apart:.1e} (relative, median)", flush=True)
 
 
+def sums(counts, draws):
+    """Median errors of the springs by one sigma for all and by the weights of sysid, both by jeuler, draw by draw."""
+    from statistics import median
+
+    import jax
+    import numpy as np
+
+    jax.config.update("jax_enable_x64", True)
+    words = "ks {:.3%}, kd {:.2%}; by sysid's weights ks {:.3%}, kd {:.2%}"
+    for count in counts:
+        errors = []
+        for draw in draws:
+            with tempfile.TemporaryDirectory() as folder:
+                record(count, draw, os.path.join(folder, "y.npy"))
+                y = np.load(os.path.join(folder, "y.npy"))
+            x, v, ks, kd = chain(count, draw)
+            found = [fit(x, v, y)[:2] for fit in (by_jeuler, by_jeuler_weighted)]
+            errors.append([np.median(np.abs(a / b - 1)) for each in found for a, b in zip(each, (ks, kd), strict=True)])
+            print(f"N = {count}, draw {draw}:", words.format(*errors[-1]), flush=True)
+        print(f"N = {count}, medians of {len(errors)} draws:", words.format(*map(median, zip(*errors, strict=True))))
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--one"]:
         one(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), sys.argv[5])
     else:
-        words, draws = sys.argv[1:], range(1)
-        if "--draws" in words:
-            first, last = (int(n) for n in words[words.index("--draws") + 1].split(":"))
-            words, draws = words[: words.index("--draws")], range(first, last)
-        main([int(n) for n in words] or [3, 20, 100], draws)
+        words, what, draws = sys.argv[1:], main, range(1)
+        for option, run in (("--draws", main), ("--sums", sums)):
+            if option in words:
+                k = words.index(option)
+                words, what, draws = words[:k] + words[k + 2 :], run, range(*map(int, words[k + 1].split(":")))
+        what([int(n) for n in words] or [3, 20, 100], draws)
