@@ -7,6 +7,7 @@ import pytest
 
 import jeuler
 from jeuler import Collisions, Plane
+from jeuler.contact.paths import share_of_the_force
 
 G = 9.8
 FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
@@ -106,3 +107,27 @@ def test_net_of_many_balls_stands_on_the_floor():
     between = (edges[:, 0] < wide) & (edges[:, 1] >= wide)
     np.testing.assert_allclose(push[between].sum(0), [0.0, G * wide * (high - 1)], atol=1e-4)
     np.testing.assert_allclose(end[:wide, 1], 0.1, atol=1e-12)
+
+
+def test_ball_that_stands_and_is_struck_from_above_stays_whatever_its_speed_was():
+    """The solve holds it, not a contact force after it; the linearly implicit step leaves half of a speed that it has."""
+    contact = Collisions((FLOOR,), pairs=[(0, 1)], radius=0.1)
+    position = jnp.array([[0.0, 0.1], [0.0, 0.31]])
+
+    def speed(of_lower):
+        state = jeuler.ParticleState(position, jnp.array([[0.0, of_lower], [0.0, -1.0]]), jnp.array([1.0, 1e-3]))
+        step = jeuler.linearly_implicit_euler_step
+        run = jeuler.simulate(jeuler.Scene((GRAVITY,), (contact,)), state, dt=0.02, num_steps=1, step=step)
+        return run.y.velocity[-1, 0, 1], run.unresolved_contacts
+
+    value, slope, count = jax.jit(lambda v: jax.jvp(speed, (v,), (jnp.ones_like(v),), has_aux=True))(0.0)
+    np.testing.assert_allclose(value, 0.0, atol=1e-12)
+    np.testing.assert_allclose(slope, 0.0, atol=1e-9)
+    assert int(count) == 0
+
+
+def test_what_a_step_holds_of_its_force_is_not_read_from_changes_within_rounding():
+    x, v = jnp.array([[0.3, 0.1], [0.3, 0.3]]), jnp.zeros((2, 2))
+    dv, dt = jnp.array([[1e-13, 0.0], [0.0, -0.3]]), 1 / 30
+    displacement = dt * v + jnp.array([[1.0], [0.5]]) * dt * dv
+    np.testing.assert_array_equal(share_of_the_force(x, displacement, v, dv, dt), [[0.5], [0.5]])

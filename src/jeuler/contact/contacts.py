@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core.vectors import direction, length, unit
+from jeuler.contact.colliders import Plane
 from jeuler.contact.paths import Path
 from jeuler.graphs.cells import rows_of_neighbours
 
@@ -171,6 +172,11 @@ class Contacts:
     def convex(self) -> Array:
         """Where the gap is a convex function of the place of the first partner relative to the second."""
         walls = np.repeat([getattr(collider, "convex", False) for collider in self.colliders], self.particles)
+        return jnp.concatenate([jnp.asarray(walls, bool), jnp.ones(len(self.i), bool)])
+
+    def curved(self) -> Array:
+        """Where the normal may be another one beside the place of contact."""
+        walls = np.repeat([not isinstance(collider, Plane) for collider in self.colliders], self.particles)
         return jnp.concatenate([jnp.asarray(walls, bool), jnp.ones(len(self.i), bool)])
 
     def possible(self) -> Array:

@@ -203,7 +203,9 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     v = look.speed / contacts.dt + look.recession[:, None] * normal
     change = bounce(v, normal, jnp.where(plastic, 0, contacts.restitution), contacts.friction)
     into = jnp.sum(bend * normal, axis=-1)
-    held = jnp.where(plastic & (into < 0), -into, 0)[:, None] * normal  # no more push into what it stays on
+    stays = plastic | (contacts.restitution == 0)  # and there is no more push into what it stays on
+    stays = stays & (into < rounding_of_speed(contacts, path))  # nor a derivative of one that the solve of a step holds
+    held = jnp.where(stays, -into, 0)[:, None] * normal
 
     zero = jnp.zeros_like(change)
     kick = contacts.move(jnp.where(now[:, None], change, zero))
@@ -327,7 +329,7 @@ def undecided(contacts: Contacts, path: Path, after: Path, events: Events, found
     if contacts.alone:
         return jnp.int32(0)
     orders, leaves = of_an_order(contacts, path, after, events, found), may_leave(path, after, events)
-    return (jnp.sum(orders) + jnp.sum(leaves)).astype(jnp.int32)
+    return (jnp.sum(orders) + jnp.sum(leaves) + jnp.sum(may_stick(contacts, events, found))).astype(jnp.int32)
 
 
 def of_an_order(contacts: Contacts, path: Path, after: Path, events: Events, found: Found) -> Array:
@@ -340,7 +342,9 @@ def of_an_order(contacts: Contacts, path: Path, after: Path, events: Events, fou
     change = contacts.relative(after.jump - path.jump)
     into = jnp.sum(change * look.normal, axis=-1)
     along = length(change - into[:, None] * look.normal)
-    noticed = jnp.abs(into) + jnp.where(contacts.friction > 0, along, 0)
+    curved = contacts.curved()  # the speed along a curved surface is one into it from beside
+    of_chosen = contacts.both(jnp.logical_or, chosen & curved[events.contact])
+    noticed = jnp.abs(into) + jnp.where((contacts.friction > 0) | curved | of_chosen, along, 0)
     walls = jnp.arange(contacts.count) < contacts.walls
     same = walls & contacts.first(chosen & (events.contact < contacts.walls))  # of two flush surfaces the order is one
     same = same & (jnp.sum(contacts.first(look.normal[events.contact]) * look.normal, axis=-1) > 1 - 1e-4)
@@ -352,6 +356,35 @@ def may_leave(path: Path, after: Path, events: Events) -> Array:
     excess, rounding = off_its_support(path, after.s, after.way)
     moved = jnp.abs(along(after.way, path.support) - path.ride)
     return (events.contact >= 0) & (jnp.abs(excess) <= 4 * rounding) & (moved > 1e-3 * length(path.support))
+
+
+def by_chance(contacts: Contacts, path: Path, events: Events, slow: Array) -> Array:
+    """Which contacts, (contact,), the impacts of a step leave touching without a load or a motion against each other.
+
+    Not those whose own plastic impact makes them so: whether the others part or press from then on, rounding decides.
+    """
+    end = contacts.look(path, jnp.ones_like(slow))
+    touches = (end.gap <= contacts.roundoff(path.x) + contacts.open(slow)) & contacts.possible()
+    still = jnp.abs(end.slope) <= slow + rounding_of_speed(contacts, path)
+    number = jnp.arange(len(events.contact))[:, None]
+    last = jnp.argmax(jnp.where(events.contact >= 0, number, -1), axis=0)
+    contact, plastic = (jnp.take_along_axis(y, last[None], axis=0)[0] for y in (events.contact, events.plastic))
+    numbers = jnp.arange(contacts.count)
+    own = (contacts.both(jnp.minimum, contact) == numbers) & (contacts.both(jnp.maximum, contact) == numbers)
+    made = own & ((contacts.restitution == 0) | contacts.first(plastic))
+    loaded = contacts.both(jnp.logical_or, jnp.any(path.support != 0, axis=-1))
+    forced = contacts.both(jnp.logical_or, jnp.any(path.bend != 0, axis=-1))
+    return touches & still & contacts.both(jnp.logical_or, path.hit) & forced & ~made & ~loaded
+
+
+def may_stick(contacts: Contacts, events: Events, found: Found) -> Array:
+    """Which impacts, (contact,), friction stops along the surface or not, as rounding decides."""
+    v, normal = found.look.speed / contacts.dt, found.look.normal
+    v_n = jnp.sum(v * normal, axis=-1) + found.look.recession
+    along = length(v - jnp.sum(v * normal, axis=-1)[:, None] * normal)
+    restitution = jnp.where(contacts.first(events.plastic), 0, contacts.restitution)
+    most = contacts.friction * (1 + restitution) * jnp.abs(v_n)
+    return met(contacts, events) & (jnp.abs(most - along) <= 1e3 * jnp.finfo(along.dtype).eps * most) & (most > 0)
 
 
 def go_through(contacts: Contacts, path: Path, events: Events, theta: Array) -> Path:

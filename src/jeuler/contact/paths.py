@@ -10,6 +10,8 @@ from jax import Array, lax
 
 from jeuler._core.vectors import unit
 
+SMALL_PART = 1e-6  # of the changes of velocity of a step: one from which nothing is to be read
+
 
 class Path(NamedTuple):
     """Where each particle is in parts s from 0 to 1 of a step of length dt, after its last impact.
@@ -67,7 +69,8 @@ def share_of_the_force(
         d = dt v + theta dt dv:   0 explicit Euler, 1 symplectic and implicit Euler, 1/2 Heun, Runge-Kutta, leapfrog
 
     A contact force that acts through the whole step moves a particle by as much of its own impulse. Where dv is within
-    rounding, as in equilibrium, it is that of the others, weighted by dv^2; 1/2 where there are none.
+    rounding, or a millionth of that of all, as in equilibrium, theta is that of the others, weighted by dv^2; 1/2 where
+    there are none.
     ``total`` sums over all particles.
     """
     along = jnp.sum((displacement - dt * v) * dv, axis=-1, keepdims=True)
@@ -77,5 +80,6 @@ def share_of_the_force(
     along, most = jnp.where(clear, along, 0), jnp.where(clear, most, 0)
     of_all = total(most)
     others = jnp.where(of_all > 0, total(along) / jnp.where(of_all > 0, of_all, 1), 0.5)
+    clear = most > SMALL_PART**2 * of_all
     part = jnp.where(clear, along / jnp.where(clear, most, 1), others)
     return lax.stop_gradient(jnp.clip(jnp.round(2 * part) / 2, 0, 1))

@@ -84,6 +84,19 @@ class Problem(NamedTuple):
         rubbed = jnp.where(weak, lax.stop_gradient(rubbed), rubbed)  # nor does it hold anything
         return push * self.normal + rubbed
 
+    def at_the_limit(self, w: Array) -> Array:
+        """Where rounding decides whether friction holds, (contact,): it is at its limit, and nothing slides.
+
+        Among many contacts several forces do the same, and it is not looked for.
+        """
+        if self.contacts.many:
+            return jnp.zeros_like(self.active)
+        velocity = self.velocity + self.contacts.relative(self.contacts.move(w))
+        most, rub = self.contacts.friction * self.push(w), w - self.push(w)[:, None] * self.normal
+        slides = velocity - self.push(velocity)[:, None] * self.normal
+        small = 0.1 * self.weak()
+        return self.active & (most > self.weak()) & (most - length(rub) <= small) & (length(slides) <= small)
+
     def weak(self) -> Array:
         """A push, m/s, that may be a rounding, or what the iterations leave."""
         return 100 * self.relative_tolerance() * self.fastest
@@ -166,11 +179,14 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
+    stays = unclear = jnp.zeros_like(active)
+    if load is not None:
+        loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
+        impulses = loads(loaded, small)
+        stays = (jnp.abs(problem.gap) <= small + problem.weak()) & (loaded.push(impulses) > loaded.weak())
+        unclear = loaded.at_the_limit(impulses)
+
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
-        stays = jnp.zeros_like(active)
-        if load is not None:
-            loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
-            stays = (jnp.abs(problem.gap) <= small + problem.weak()) & pressing(loaded, small)
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
     if contacts.alone:  # each particle for itself: exact at once
@@ -178,7 +194,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         gap = problem.gap + problem.push(problem.theta * w)
         on = pressed(w, problem.velocity + w) | lax.stop_gradient(active & (gap < -small))
         u = jnp.concatenate([w, jnp.where(on, -gap, 0)[:, None]], axis=1)
-        unresolved = jnp.int32(0)
+        unresolved = jnp.sum(unclear | lax.stop_gradient(problem.at_the_limit(w))).astype(jnp.int32)
     else:
         rate = contacts.rate(active)
         start, error = checkpoint_name(_iterate(lax.stop_gradient(problem), small), REST)
@@ -190,7 +206,8 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         u = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
         off = lax.stop_gradient(problem.residual(u, rate, on, overlap))  # Newton's step may have ended it
         off = jnp.minimum(error, jnp.maximum(length(off[:, :-1]) / rate, jnp.abs(off[:, -1])))
-        unresolved = jnp.sum(active & (off > _tolerated(problem) + small)).astype(jnp.int32)
+        unclear = unclear | (off > _tolerated(problem) + small) | problem.at_the_limit(u[:, :-1])
+        unresolved = jnp.sum(active & lax.stop_gradient(unclear)).astype(jnp.int32)
     w, q = u[:, :-1], u[:, -1]
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)
@@ -198,11 +215,10 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     return Rest(contacts.move(w), w, contacts.dt * shift, on, left, unresolved)
 
 
-def pressing(problem: Problem, small: Array) -> Array:
-    """Which contacts, (contact,), push in the answer; overlaps of ``small``, over dt, m/s, are none. No derivative."""
-    if problem.contacts.alone:
-        return problem.push(problem.project(-problem.velocity)) > problem.weak()
-    return problem.push(_impulses(lax.stop_gradient(problem), small)[0]) > problem.weak()
+def loads(problem: Problem, small: Array) -> Array:
+    """The impulses, (contact, dim), of the answer; overlaps of ``small``, over dt, m/s, are none. No derivative."""
+    problem = lax.stop_gradient(problem)
+    return problem.project(-problem.velocity) if problem.contacts.alone else _impulses(problem, small)[0]
 
 
 def together(problem: Problem, small: Array) -> tuple[Array, Array]:

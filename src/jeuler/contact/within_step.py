@@ -15,7 +15,7 @@ from jeuler._core.vectors import length
 from jeuler._jax.anywhere import where_needed
 from jeuler._jax.found import found, found_p
 from jeuler.contact.contacts import Contacts, Look
-from jeuler.contact.impacts import go_through, impulsive_limit, schedule
+from jeuler.contact.impacts import by_chance, go_through, impulsive_limit, schedule
 from jeuler.contact.paths import Path, free_path, share_of_the_force
 from jeuler.contact.rest import REST, Problem, at_rest, together
 
@@ -63,6 +63,8 @@ def _resolve(
     touched = (touched | after.hit)[:, None]
     position = jnp.where(touched, moved, x_free)
     velocity = jnp.where(touched, v_end + jump, v_free)
+    if not (contacts.alone or contacts.many):
+        undecided = undecided + jnp.sum(by_chance(contacts, after, events, slow)).astype(jnp.int32)
     if len(contacts.colliders) > 1 or len(contacts.i):
         unchanged = jnp.zeros_like(velocity), jnp.zeros_like(position)
         operands = lax.stop_gradient((contacts, after, velocity, slow))
