@@ -203,9 +203,8 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     v = look.speed / contacts.dt + look.recession[:, None] * normal
     change = bounce(v, normal, jnp.where(plastic, 0, contacts.restitution), contacts.friction)
     into = jnp.sum(bend * normal, axis=-1)
-    stays = plastic | (contacts.restitution == 0)  # and there is no more push into what it stays on
-    stays = stays & (into < rounding_of_speed(contacts, path))  # nor a derivative of one that the solve of a step holds
-    held = jnp.where(stays, -into, 0)[:, None] * normal
+    stays = plastic & (into < rounding_of_speed(contacts, path))  # without a push too, as where a solve holds it
+    held = jnp.where(stays, -into, 0)[:, None] * normal  # no more push into what it stays on
 
     zero = jnp.zeros_like(change)
     kick = contacts.move(jnp.where(now[:, None], change, zero))
