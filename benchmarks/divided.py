@@ -16,17 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jeuler
-from jeuler.scenes.shapes import Body, rows
+from jeuler.meshes.bodies import grid
+from jeuler.scenes.shapes import Body
 
 
 def sheet(long: int, wide: int, apart: float) -> Body:
     """A level sheet of long x wide particles, so far apart, joined along its threads and across its meshes."""
-    g = np.arange(long * wide).reshape(long, wide)
-    x, y = np.meshgrid(*[apart * (np.arange(n) - n / 2) for n in (long, wide)], indexing="ij")
-    edges = [rows(g[:-1], g[1:]), rows(g[:, :-1], g[:, 1:]), rows(g[:-1, :-1], g[1:, 1:]), rows(g[:-1, 1:], g[1:, :-1])]
-    lines = [rows(g[:-2], g[1:-1], g[2:]), rows(g[:, :-2], g[:, 1:-1], g[:, 2:])]
-    place = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
-    return Body(place, np.concatenate(edges), np.zeros((0, 3), int), np.concatenate(lines))
+    return Body(*grid((long, wide), (apart * (long - 1), apart * (wide - 1))))
 
 
 @dataclasses.dataclass
