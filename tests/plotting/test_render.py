@@ -216,7 +216,8 @@ def test_what_moves_on_a_line_is_drawn_and_filmed(tmp_path):
     solution = Solution(jnp.arange(2.0), jax.tree.map(lambda x: jnp.stack([x, x]), weight), jnp.int32(-1))
     made = animate(solution, scene, tmp_path / "line.gif", progress=False)
     assert repr(made) == "Film(2 frames, to t = 1 s, 25 a second of film)"
-    assert Image.open(tmp_path / "line.gif").n_frames == 1, "nothing moves: Pillow keeps one"
+    with Image.open(tmp_path / "line.gif") as picture:
+        assert picture.n_frames == 1, "nothing moves: Pillow keeps one"
     ax = draw(weight, scene, camera=Camera(center=[0.5], width=3.0))
     lines = next(c for c in ax.collections if isinstance(c, LineCollection))
     np.testing.assert_allclose(lines.get_segments(), [[[0.0, 0.0], [1.5, 0.0]]])

@@ -20,14 +20,13 @@ from jax.interpreters import ad, batching, mlir
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jeuler._jax.batch_last import reached
-from jeuler._jax.jaxpr import Jaxpr, Primitive, evaluate
+from jeuler._jax.jaxpr import Jaxpr, evaluate, holding_programs
 from jeuler._jax.members import _batched, _chosen, _merged, _others, _tangent, _transposed
 from jeuler._jax.placed import as_varying, bare, explicit_mesh, is_placed, manual_axes, type_of, varying_axes
 
 PyTree = Any
 
-apart_p = Primitive("apart")
-apart_p.multiple_results = True
+apart_p = holding_programs("apart")
 
 
 @contextlib.contextmanager

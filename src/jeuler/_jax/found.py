@@ -14,12 +14,11 @@ import jax.numpy as jnp
 from jax import lax
 from jax.interpreters import ad, batching, mlir
 
-from jeuler._jax.jaxpr import Primitive, evaluate
+from jeuler._jax.jaxpr import evaluate, holding_programs
 
 # Operands: the value's arrays, then what the program reads. Parameters: ``program``, a closed jaxpr of the latter to
 # what the value's arrays are; ``count``, how many these are.
-found_p = Primitive("found")
-found_p.multiple_results = True
+found_p = holding_programs("found")
 
 
 def found(value: Any, function: Callable[[], Any]) -> Any:

@@ -22,7 +22,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jeuler._jax import platforms
 from jeuler._jax.batch_last import batch_last, fits, mostly_numbers, reached
-from jeuler._jax.jaxpr import Jaxpr, Primitive, evaluate
+from jeuler._jax.jaxpr import Jaxpr, evaluate, holding_programs
 from jeuler._jax.placed import is_placed
 
 MANY = 64  # members from which on the batch axis goes last,
@@ -31,8 +31,7 @@ SHORT = 48  # if no operand of one member has a longer last axis: longer loops a
 # Operands to results. Parameters: the jaxpr of one member; ``size``, how many members have their axis in the operands,
 # None for one alone; ``axes``, where in each operand, None if it is the same for all; ``batched``, which results depend
 # on the member, their axis first; ``differentiated``, whether a derivative was taken of the equation, or is it.
-members_p = Primitive("members")
-members_p.multiple_results = True
+members_p = holding_programs("members")
 
 
 def recomputed(function: Callable) -> Callable:
