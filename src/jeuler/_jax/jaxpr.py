@@ -11,6 +11,7 @@ from jax.interpreters import partial_eval
 
 Jaxpr = Any
 Primitive: Any = type(lax.add_p)
+rewriting: Any = partial_eval  # its ``lower_jaxpr2`` is of JAX 0.12
 
 
 def evaluate(jaxpr: Jaxpr, operands: Sequence[Any]) -> list[Any]:
@@ -29,7 +30,7 @@ def holding_programs(name: str) -> Primitive:
 
     def to_lojax(*operands: Any, **parameters: Any) -> list[Any]:
         low = {
-            name: partial_eval.lower_jaxpr2(value) if getattr(value, "is_high", False) else value
+            name: rewriting.lower_jaxpr2(value) if getattr(value, "is_high", False) else value
             for name, value in parameters.items()
         }
         return primitive.bind(*operands, **low)
