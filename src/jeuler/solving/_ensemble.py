@@ -163,12 +163,9 @@ class _Work:
         batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.size, *np.shape(x)[1:]), x.dtype), members)
         real = jax.ShapeDtypeStruct((self.size,), np.bool_)
         states = jax.eval_shape(functools.partial(_first_states, Function(self.run), self.reducers, {}), batch, real)
-        later = jax.eval_shape(functools.partial(_next, Function(self.run), self.reducers, None), states, batch, real)[
-            0
-        ]
-        _check_same_form(states, later)
         # on one device, so that it does not matter which of several processes has which
         lowered, dynamic = programs.lowered(_next, (Function(self.run),), (self.reducers, None), states, batch, real)
+        _check_same_form(states, lowered.out_info[0])
         devices = 1 if self.mesh is None else self.mesh.size
         store = Store(resume, fingerprint(lowered, [*dynamic, *jax.tree.leaves(members), devices]), MEMBERS)
         if self.mesh is not None:
