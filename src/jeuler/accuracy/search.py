@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from jeuler._core import trees
 from jeuler._core.precision import double_precision, flat
 from jeuler.accuracy.known_end import Reference, find_reference, is_jump
 from jeuler.accuracy.leading import LARGEST_ORDER, LeadingError
+from jeuler.accuracy.patience import Patience
 from jeuler.accuracy.pilot import Ladder, Pilot, distance, norm
 from jeuler.accuracy.roundoff import Rounding
 from jeuler.solving._breaks import SIDE
@@ -26,7 +25,6 @@ PyTree = Any
 AIM = 0.8  # of the target: an answer errs on the side of accuracy
 NEAR = 0.75  # of the aim: an error between this and the aim ends the search
 FACTOR = 3.0  # an error within this factor of the target is near it
-EDGE = 0.008  # part of the number of steps to which the edge of stability is found
 MARGIN = 0.01  # by which dt may be larger with the error still near the target
 FINENESS = 1e-3  # part of the number of steps below which the search makes no difference
 TRUST = 0.1  # the extrapolated state must be known to this part of the error it judges
@@ -34,30 +32,12 @@ REGULAR = 0.25  # and the observed order be this close to the step's own, to pre
 OFF = 0.93, 0.79, 0.61  # parts of the finest rung: numbers of steps that share no pattern with it
 NONE = 1e-3  # part of the target that is no error
 EVEN = 2.5  # times the error that the order of the step tells of them
-BESIDE = 0.97, 0.985, 1.015, 1.03  # parts of a number of steps, to see that its own error is no accident
-ACCIDENT = 3  # times the fewest steps at most, for an error that is no accident of the grid
-FINER, FINE = 1.1, 1.02  # from one number of steps to the next where errors are uneven, many or few
-BETWEEN = 20, 400  # numbers of steps at least and at most, where the error of all these was far below the target
 NEAR_ENOUGH = 4  # an answer of up to this part of the longest pilot run is run itself, not predicted
 DOUBLINGS = 64  # times the steps that stability asks for, to see how the error falls from there on
 ROUGH = 2**18  # steps of the longest run in float32
 ROUGHEST = 1e-30  # an end below this sinks under the numbers of float32, whose runs then say nothing of roundoff
 FOLLOWS = 0.05  # part of an error by which the end of a run may miss that of the modified equation
 TINY = 1e-290  # a final state below this has no scale of its own
-
-
-class Patience:
-    """Seconds after which no further run is begun."""
-
-    seconds: float
-    begun: float
-
-    def __init__(self, seconds: float) -> None:
-        self.seconds, self.begun = seconds, time.perf_counter()
-
-    @property
-    def over(self) -> bool:
-        return time.perf_counter() - self.begun > self.seconds
 
 
 class Search:
@@ -323,52 +303,6 @@ class Search:
                     return None
                 num_steps = math.ceil(num_steps * (error / (0.95 * aim)) ** (1 / self.order))
         return None
-
-    def uneven(self, final: np.ndarray, start: int = 0) -> tuple[int, float] | None:
-        """The fewest steps of a scan whose own run meets the aim, with runs beside it near.
-
-        The numbers of steps are 2 % apart where these are few, and else 10 % and then 1 %. They begin at a quarter of
-        what stability asks for, half if that is many, or at ``start``. An error far below the target beside others that
-        are not is an accident of where the jumps fall on that grid: it is taken only if no other number of steps up to
-        three times as many will do. Where only an error far below the target was found, up to 400 numbers of steps are
-        run from half as many on: the first that is near the target is taken, or else the fewest that will do.
-        """
-        many = self.most > self.planned
-        num_steps = start or max(1, math.floor(self.interval / self.bound / (2 if many else 4)))
-        error_of = functools.cache(functools.partial(self.error_after, final=final))
-        beside = lambda n: max(error_of(max(1, round(n * part))) for part in BESIDE)  # noqa: E731
-        meets = lambda n: error_of(n) <= AIM and beside(n) <= FACTOR  # noqa: E731
-        least, accident, spent, found = num_steps, 0, 0, 0
-        longest = lambda: self.most if not self.patience.over else 0  # noqa: E731
-        while not found and num_steps <= min(longest(), accident or self.most) and spent <= 3 * self.most:
-            if meets(num_steps):
-                if error_of(num_steps) >= 1 / FACTOR or beside(num_steps) <= 1 / FACTOR:
-                    found = num_steps
-                accident = accident or ACCIDENT * num_steps
-            spent += num_steps
-            finer = FINE if num_steps <= self.planned // 64 else FINER
-            num_steps = max(num_steps + 1, round(finer * num_steps))
-        found = found or accident // ACCIDENT
-        if not found:
-            return None
-        if math.isinf(error_of(round(found / FINER))):
-            found = self.on_edge(error_of, found)
-        elif error_of(found) < 1 / FACTOR and not many:
-            counts = np.linspace(max(least, found / 2), found * FINER, int(np.clip(self.most // found, *BETWEEN)))
-            do = [n for n in map(math.ceil, counts) if not self.patience.over and meets(n)]
-            found = next((n for n in do if error_of(n) >= 1 / FACTOR), min([*do, found]))
-        return found, error_of(found) * self.error * self.scale(final)
-
-    def on_edge(self, error_of: Callable[[int], float], high: int) -> int:
-        """The fewest steps, to a hundredth, that meet the aim and are stable, as they are with dt 1 % larger."""
-        low = round(high / FINER)
-        while high - low > max(1, EDGE * high) and not self.patience.over:
-            middle = (low + high) // 2
-            if error_of(middle) <= AIM and error_of(math.ceil(middle * (1 - MARGIN))) <= FACTOR:
-                high = middle
-            else:
-                low = middle
-        return high
 
     def error_after(self, num_steps: int, final: np.ndarray) -> float:
         """Error of a run in terms of the target; inf where it is not finite."""
