@@ -3,7 +3,7 @@
     python benchmarks/recordings.py                      everything; about half an hour on two cores
     python benchmarks/recordings.py quirks FOLDER        every file of a folder (default tests/data/recordings)
     python benchmarks/recordings.py measured FOLDER      the measured files of ../shared/data
-    python benchmarks/recordings.py pendulum FOLDER      its single pendulum to 55 s by frictions that no option names
+    python benchmarks/recordings.py pendulum FOLDER      its single pendulum to 55 s: what each friction leaves
     python benchmarks/recordings.py long                 18,000 and 1,000,000 rows, 723 rows, reading 100,000 rows
     python benchmarks/recordings.py damaged [COUNT]      damaged files, each by a process of its own
     python benchmarks/recordings.py users                six kinds of file as a new user goes: look, then its command
@@ -110,7 +110,11 @@ def measured(folder: str = str(ROOT.parent / "shared" / "data")) -> None:
 
 
 def pendulum(folder: str = str(ROOT.parent / "shared" / "data")) -> None:
-    """The friction of the bearing: a damper, air and a dry bearing at once, and a dry one that falls with the speed."""
+    """The friction of the bearing: a damper and air; with a dry bearing; with a dry one that falls with the speed.
+
+    What a wrong friction leaves is a pattern: the model swings too far at some times and not far enough at others, and
+    so too late or too early. Each window of 2 s tells how far: the parts of its residual along the angle and the speed.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -120,6 +124,9 @@ def pendulum(folder: str = str(ROOT.parent / "shared" / "data")) -> None:
     times, columns = jeuler.read_trajectory(os.path.join(folder, "pendulum_single.csv"), si=True)
     angle = next(iter(columns.values()))[times <= 55]
 
+    def without(v, p):
+        return p["kd"] * v + p["quadratic"] * v * jnp.abs(v)
+
     def three(v, p):
         return p["kd"] * v + p["quadratic"] * v * jnp.abs(v) + p["dry"] * jnp.tanh(v / 0.05)
 
@@ -127,24 +134,35 @@ def pendulum(folder: str = str(ROOT.parent / "shared" / "data")) -> None:
         more = 1 + p["more"] * jnp.exp(-jnp.abs(v) / p["speed"])
         return p["quadratic"] * v * jnp.abs(v) + p["dry"] * more * jnp.tanh(v / 0.05)
 
-    def residual(friction, p, data):
+    def run(friction, p):
         def motion(t, y, args):
             return jnp.stack([y[1], -p["w2"] * jnp.sin(y[0] - p["zero"]) - friction(y[1], p)])
 
-        run = jeuler.solve(motion, p["start"], dt=0.01, num_steps=len(angle) - 1, step=jeuler.rk4_step)
-        return run.y[:, 0] - data
+        return jeuler.solve(motion, p["start"], dt=0.01, num_steps=len(angle) - 1, step=jeuler.rk4_step).y
+
+    def left(moved):
+        """The largest part that the swing is off by, and s that it is late by, in a window of 2 s after the first."""
+        parts = []
+        for k in range(200, len(angle) - 200, 200):
+            swing, speed = moved[k : k + 200].T
+            along = np.stack([swing, -speed, np.ones(200)], axis=1)
+            parts.append(np.linalg.lstsq(along, angle[k : k + 200] - swing)[0][:2])
+        return np.abs(parts).max(axis=0)
 
     begin = {"w2": 64.1, "zero": 0.0, "start": jnp.array([angle[0], 1.9]), "quadratic": 0.006}
     for friction, own in (
+        (without, {"kd": 0.1}),
         (three, {"kd": 0.0, "dry": 0.15}),
         (falling, {"dry": 0.12, "more": 1.5, "speed": 2.0}),
     ):
         began = time.process_time()
-        found = jeuler.fit(lambda p, data, f=friction: residual(f, p, data), {**begin, **own}, data=angle)
+        found = jeuler.fit(lambda p, data, f=friction: run(f, p)[:, 0] - data, {**begin, **own}, data=angle)
+        swing, late = left(np.asarray(run(friction, found.params)))
         numbers = ", ".join(f"{name} {float(found.params[name]):.4g}" for name in ("w2", "quadratic", *own))
         share = 100 * np.sqrt(found.loss) / np.abs(angle).max()
         print(
-            f"{friction.__name__}: {numbers}; {share:.3g} % of the amplitude, lag one {found.autocorrelation:.3f}, "
+            f"{friction.__name__}: {numbers}; {share:.3g} % of the amplitude, swing off by {100 * swing:.2g} % and "
+            f"{1e3 * late:.2g} ms at most, lag one {found.autocorrelation:.3f}, "
             f"{time.process_time() - began:.1f} s of CPU; {found.message}",
             flush=True,
         )
