@@ -48,6 +48,10 @@ def test_dry_friction_is_told_from_viscous(folder, capsys):
     scores = {row["friction"]: row["score"] for row in told["comparison"]}
     assert scores["dry"] == 0
     assert scores["viscous"] > 100
+    rms = {tuple(row["friction"].split("+")): row["rms"] for row in told["comparison"]}
+    assert len(rms) == 6
+    for law in rms:  # one of two parts begins where the better of these ended
+        assert rms[law] <= min(rms[part,] for part in law) * (1 + 1e-9)
     assert "friction viscous " in capsys.readouterr().out
     wrong = fitted("dry.csv", "--mass", 0.25)
     assert any("Try --friction compare" in warning for warning in wrong["warnings"])

@@ -195,10 +195,21 @@ def _places(model: Model, measured: Measurement) -> dict[str, Any]:
 
 
 def estimate(
-    model: Model, measured: Measurement, guess: Oscillation, dt: float, asked: dict[str, float], max_iterations: int
+    model: Model,
+    measured: Measurement,
+    guess: Oscillation,
+    dt: float,
+    asked: dict[str, float],
+    max_iterations: int,
+    simpler: Estimate | None = None,
 ) -> Estimate:
-    """Fit the model; coefficients that come out negative and cannot be are held at 0, and the rest is fitted again."""
+    """Fit the model; coefficients that come out negative and cannot be are held at 0, and the rest is fitted again.
+
+    It starts where a simpler model ended, if one is given: what that lacks is 0.
+    """
     start, grow = starting_values(model, measured, guess, asked)
+    if simpler is not None:
+        start = {name: np.asarray(simpler.params.get(name, np.zeros_like(value))) for name, value in start.items()}
     unknowns, samples = sum(np.size(x) for x in start.values()), int(np.isfinite(measured.positions).sum())
     if samples <= unknowns:
         raise ValueError(

@@ -151,15 +151,20 @@ def _band_limited_drive(measured: Measurement) -> tuple[np.ndarray, float, float
 def _fit(
     arguments: argparse.Namespace, model: Model, measured: Measurement, guess: Oscillation, dt: float
 ) -> tuple[Estimate, list[dict[str, Any]]]:
-    """The fit, or with ``--friction compare`` the best of the friction laws by the Bayesian information criterion."""
+    """The fit, or with ``--friction compare`` the best of the friction laws by the Bayesian information criterion.
+
+    A law of two parts begins where the better of these ended.
+    """
     asked = options.start(arguments.start)
     if arguments.friction != "compare":
         return estimate(model, measured, guess, dt, asked, arguments.max_iterations), []
     kinds = [("viscous",), ("quadratic",), ("dry",), ("viscous", "dry"), ("viscous", "quadratic"), ("quadratic", "dry")]
-    tried = [
-        estimate(dataclasses.replace(model, friction=kind), measured, guess, dt, asked, arguments.max_iterations)
-        for kind in kinds
-    ]
+    tried: list[Estimate] = []
+    for kind in kinds:
+        parts = [tried[kinds.index((part,))] for part in kind if len(kind) > 1]
+        simpler = min(parts, key=lambda found: found.loss, default=None)
+        own = dataclasses.replace(model, friction=kind)
+        tried.append(estimate(own, measured, guess, dt, asked, arguments.max_iterations, simpler))
     samples = int(np.isfinite(measured.positions).sum())
     scores = []
     for found in tried:
