@@ -6,16 +6,21 @@ import re
 
 # Small matrices by one thread: two processes on two cores with two threads each wait for each other. Before NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Most of the time is XLA's, and most programs run once: LLVM does not optimise them, nor those of processes that tests
+# start. `JAX_DISABLE_MOST_OPTIMIZATIONS=0 XLA_FLAGS=" " pytest` compiles as users do. Before JAX.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 import jax
 import pytest
 from _pytest.doctest import DoctestItem
 
 ROOT = pathlib.Path(__file__).resolve().parent
-# Most of the time is XLA's. Its older way to write loops makes the same programs in half of it. Flags of your own
-# stay: `XLA_FLAGS=" " pytest` tests what users run. A version that is not known might stop at a flag it does not have.
+HASTE = "jax_disable_most_optimizations"
+HASTY = jax.config.read(HASTE)
+# XLA's older way to write loops takes half the time again, one piece of code less than many. Flags of your own stay;
+# a version that is not known might stop at a flag it does not have.
 if jax.__version__.startswith("0.10."):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1")
 NAMED_SKIPS = ROOT / "tests" / "skips.txt"
 FAST = (
     "tests/_core",
@@ -41,6 +46,20 @@ def precision(request):
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "fast: a subset of all kinds of tests that takes less than two minutes")
+    config.addinivalue_line("markers", "optimised: compiled as for users, as it is about rounding, bits or speed")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Optimise programs of doctests and of tests marked ``optimised``, also in processes they start, and of no others.
+
+    Neither kind finds the other's among those that JAX keeps.
+    """
+    hasty = HASTY and item.get_closest_marker("optimised") is None and not isinstance(item, DoctestItem)
+    if jax.config.read(HASTE) != hasty:
+        os.environ[HASTE.upper()] = str(int(hasty))
+        jax.config.update(HASTE, hasty)
+        jax.clear_caches()
 
 
 def pytest_collection_modifyitems(items):

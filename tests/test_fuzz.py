@@ -13,6 +13,8 @@ import jeuler
 from jeuler import Collisions
 from jeuler.contact.colliders import Plane, Sphere
 
+pytestmark = pytest.mark.optimised  # it is about rounding
+
 SCENES_AT_ONCE, EXAMPLES, STEPS = 25, 12, 20
 SHAPES = {  # particles, edges, colliders, pairs that collide
     "tree": (5, [[0, 1], [1, 2], [1, 3]], (), ()),  # particle 4 is free

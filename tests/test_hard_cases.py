@@ -280,6 +280,7 @@ def test_pendulum_gradient_has_the_sign_of_finite_differences_until_the_horizon(
     np.testing.assert_allclose(gradient, difference, rtol=1e-2)
 
 
+@pytest.mark.optimised
 def test_capped_cotangent_bounds_the_gradient_of_a_chaotic_run():
     free = pendulum(10000, jeuler.symplectic_euler_step)
     capped = pendulum(10000, cap_cotangent(jeuler.symplectic_euler_step, 2.0))

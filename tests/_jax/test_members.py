@@ -87,6 +87,7 @@ def test_batches_nest_around_and_inside_derivatives(function):
     np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.optimised
 def test_one_member_that_overflows_leaves_the_others_alone(members):
     position, ks, kd = members
     run = jax.jit(jax.grad(lambda p: jnp.sum(jax.vmap(loss, (0, 0, None))(p, ks, kd))))

@@ -116,6 +116,7 @@ FLOORS = {
 }
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     ("problem", "step"), [*((name, jeuler.euler_step) for name in FLOORS), ("logistic growth", jeuler.heun_step)]
 )
@@ -148,6 +149,7 @@ def test_a_mode_too_fast_for_any_pilot_is_refused_not_waited_for():
     assert "rk4_step" in advice.reason
 
 
+@pytest.mark.optimised
 def test_it_refuses_below_the_roundoff_floor_of_float32_and_names_what_could():
     y0, field = jnp.float32(1.0), lambda t, y, args: -y
     advice = advise_step(field, y0, t1=1.0, error=1e-9)

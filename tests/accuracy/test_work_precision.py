@@ -167,6 +167,7 @@ def test_the_figure_has_the_axes_asked_for(table):
     plt.close("all")
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.rk4_step, linearly_implicit_euler_step])
 @pytest.mark.parametrize("compensated", [False, True])
@@ -377,6 +378,7 @@ def test_a_run_that_would_take_too_long_is_a_row_with_its_reason():
     assert skipped["num_steps"] == skipped["evaluations"] == 1_000_000_000
 
 
+@pytest.mark.optimised
 def test_roundoff_floor_is_found_in_float32_and_falls_with_compensated_sums():
     table = work_precision(
         lambda t, y, args: -y,

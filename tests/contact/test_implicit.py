@@ -130,6 +130,7 @@ def test_plastic_landing_holds_the_derivative_of_a_force_that_the_solve_holds():
         np.testing.assert_allclose([value, slope], 0.0, atol=1e-15)
 
 
+@pytest.mark.optimised
 def test_what_a_step_holds_of_its_force_is_not_read_from_changes_within_rounding():
     x, v = jnp.array([[0.3, 0.1], [0.3, 0.3]]), jnp.zeros((2, 2))
     dv, dt = jnp.array([[1e-13, 0.0], [0.0, -0.3]]), 1 / 30

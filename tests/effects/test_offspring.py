@@ -94,6 +94,7 @@ def touches(y):
     return np.diff(np.asarray(y.births)).tolist()
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("height", [0.25, 0.3, 0.3001, 1e-3])
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

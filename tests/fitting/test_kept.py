@@ -85,6 +85,7 @@ def same(found, whole):
     return structure == other and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(leaves, others, strict=True))
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("name", FITS)
 def test_killed_or_interrupted_it_goes_on_to_the_same_bits(name, tmp_path, stopped, monkeypatch):
     if "without" in name:

@@ -85,6 +85,7 @@ def test_far_from_the_minimum_it_does_not_say_converged(without_a_jacobian):
     assert len(found.history) == 2
 
 
+@pytest.mark.optimised
 def test_interrupted_it_keeps_the_best_and_goes_on_to_the_same_result(tmp_path, without_a_jacobian, monkeypatch):
     without_a_jacobian()
     x, kept = {"a": np.ones(6), "k": np.full(6, 3.0)}, tmp_path / "state.npz"

@@ -18,6 +18,7 @@ SCENE = Scene(
 )
 
 
+@pytest.mark.optimised
 def test_a_run_in_windows_is_the_same_run():
     def run(windows):
         return simulate(

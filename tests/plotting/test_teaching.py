@@ -60,6 +60,7 @@ def test_local_error_is_that_of_one_step_from_the_exact_solution():
     assert cumulative[-1] > 10 * local[-1]
 
 
+@pytest.mark.optimised
 def test_error_against_dt_turns_up_in_float32_and_not_with_compensated_sums():
     drawn = teaching.error_against_dt(
         lambda t, y, args: -y,

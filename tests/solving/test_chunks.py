@@ -15,6 +15,8 @@ import pytest
 import jeuler
 from jeuler.solving import chunks
 
+pytestmark = pytest.mark.optimised  # it is about bits
+
 KEY = jax.random.key(3)
 PAIR = jeuler.ParticleState([[0.0, 0.0], [1.2, 0.0]], np.zeros((2, 2)), mass=[np.inf, 0.5])
 SPRING = jeuler.Springs([[0, 1]], ks=100.0, kd=0.1, rest_length=1.0)

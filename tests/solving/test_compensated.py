@@ -9,6 +9,8 @@ import jeuler
 from jeuler._core.precision import precision
 from jeuler.steps.extrapolated import extrapolated_euler
 
+pytestmark = pytest.mark.optimised  # it is about rounding
+
 EPS = float(np.finfo(np.float32).eps)
 
 

@@ -98,6 +98,7 @@ def numbers(found):
     return jax.tree.leaves((found.results, [vars(value) for value in (found.reduced or {}).values()]))
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize("mesh", [None, "one device"])
 @pytest.mark.parametrize("reduce", [None, BOTH])
 @pytest.mark.parametrize("stop", [Killed, KeyboardInterrupt])

@@ -15,6 +15,8 @@ import xarray
 
 import jeuler
 
+pytestmark = pytest.mark.optimised  # it is about bits
+
 JET = jeuler.Emitter(60.0, [0.0, 0.0], jeuler.Normal(0.0, jnp.ones(2)), max_births=2, bursts=((0.5, 3),))
 SPARKS = jeuler.SubEmitter(2, jeuler.Normal(0.0, jnp.ones(2)), max_births=4)
 POOL = jeuler.Scene((jeuler.Gravity([0.0, -9.8]),), (jeuler.Lifetime(0.4), SPARKS, JET, jeuler.Trail(3, every=2)))

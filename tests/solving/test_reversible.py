@@ -67,6 +67,7 @@ def test_gradient_of_a_net_for_every_parameter_and_in_a_batch():
     np.testing.assert_allclose(*(jax.jit(jax.vmap(slope))(ks) for slope in slopes), rtol=1e-9)
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(("dtype", "num_steps"), [(jnp.float32, 3000), (jnp.float64, 10_000)])
 def test_chaotic_run_is_undone_to_the_bit(dtype, num_steps):
     """The gradient has grown by 1e8 and more: roundoff on the way back would end elsewhere, and NaN would say so."""

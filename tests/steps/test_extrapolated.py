@@ -106,6 +106,7 @@ def test_adaptive_run_meets_its_tolerance_and_agrees_with_lsoda():
     assert errors[2] < 1e-8
 
 
+@pytest.mark.optimised
 def test_derivatives_of_an_adaptive_run_agree_with_diffrax_in_both_modes():
     def final(mu):
         return solve_adaptive(van_der_pol, START, t1=4.0, args=mu, rtol=1e-10, atol=1e-10, max_steps=2048).y[0][-1]
