@@ -8,14 +8,10 @@ import pytest
 from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((pathlib.Path(__file__).resolve().parent.parent / "notebooks").glob("*.ipynb"))
-TIMED = ("02_what_accuracy_costs", "04_particle_scenes")  # they show seconds of runs, on the site too
 
 
-def row(path):
-    return pytest.param(path, id=path.stem, marks=[pytest.mark.optimised] if path.stem in TIMED else [])
-
-
-@pytest.mark.parametrize("path", map(row, NOTEBOOKS))
+@pytest.mark.optimised
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, tmp_path, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel shows figures with a backend of its own
     notebook = nbformat.read(path, as_version=4)
