@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 import jax.numpy as jnp
 from jax import Array
 
+from jeuler._core.choice import where
+
 
 def total(terms: Iterable[Array]) -> Array:
     """The sum of one array or more, without the 0 that ``sum`` begins with."""
@@ -27,17 +29,24 @@ def apart(square: Array) -> Array:
 
 def direction(d: Array) -> tuple[Array, Array]:
     """Length r and unit vector u = d / r along the last axis; both, with all derivatives, are 0 where ends coincide."""
-    square = jnp.sum(d * d, axis=-1, keepdims=True)
-    not_0 = apart(square)
-    r = jnp.where(not_0, jnp.sqrt(jnp.where(not_0, square, 1)), 0)
-    return r, jnp.where(not_0, d / jnp.where(not_0, r, 1), 0)
+    r, not_0 = _root(d)
+    return where(not_0, r, 0), where(not_0, d / r, 0)
 
 
 def length(x: Array) -> Array:
     """|x| along the last axis; 0 at x = 0, with all its derivatives."""
-    return direction(x)[0][..., 0]
+    r, not_0 = _root(x)
+    return where(not_0, r, 0)[..., 0]
 
 
 def unit(x: Array) -> Array:
     """x / |x| along the last axis; 0 at x = 0, with all its derivatives."""
-    return direction(x)[1]
+    r, not_0 = _root(x)
+    return where(not_0, x / r, 0)
+
+
+def _root(d: Array) -> tuple[Array, Array]:
+    """|d| along the last axis, kept, 1 where it is 0; and where it is not."""
+    square = jnp.sum(d * d, axis=-1, keepdims=True)
+    not_0 = apart(square)
+    return jnp.sqrt(where(not_0, square, 1)), not_0

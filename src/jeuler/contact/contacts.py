@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jeuler._core.choice import where
 from jeuler._core.vectors import direction, length, unit
 from jeuler.contact.colliders import Plane
 from jeuler.contact.paths import Path
@@ -20,7 +21,13 @@ NARROWER = 8  # reaches, each half of the one before, that are tried where pairs
 WAY_OF_FORCES = 1e3  # of an approach that is none, is the way that the forces of a step make
 TOUCH, LIFT = 8, 16  # units in the last place of the coordinates
 ROW = 24  # balls within reach of one: 12 can touch one of their size in space
+THERE: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}  # of an index: it needs no check
 CANDIDATES = 2  # pairs followed in a step, for each particle and dimension, where there are many more of them
+
+
+def rows(y: Array, k: Array) -> Array:
+    """y[k] of indices that are there."""
+    return y.at[k].get(**THERE)
 
 
 class Look(NamedTuple):
@@ -54,6 +61,9 @@ class Contacts:
     i: Array  # (pair,), the first particle
     j: Array
     listed: Array  # (pair,), False in slots without a pair
+    parts: tuple[Array, Array]  # of each, (pair,): what of a change of their relative velocity falls to either
+    possible: Array  # (contact,), which can occur: both partners are alive, and one of them can move
+    reach: Array  # (contact,), the distance of centres, or from the surface, at which partners touch, m
     left_out: Array  # how many pairs found no slot
 
     def __init__(self, collisions: Any, t0: Array, dt: Array, x: Array, mass: Array, alive: Array | None) -> None:
@@ -62,13 +72,13 @@ class Contacts:
         self.t0, self.dt = t0.astype(dtype), dt.astype(dtype)
         self.restitution, self.friction = collisions.restitution.astype(dtype), collisions.friction.astype(dtype)
         self.radius = jnp.broadcast_to(collisions.radius.astype(dtype), self.particles)
-        mass = mass if alive is None else jnp.where(alive, mass, jnp.inf)  # whatever the mass of a dead slot is
+        mass = mass if alive is None else where(alive, mass, jnp.inf)  # whatever the mass of a dead slot is
         self.inverse_mass = jnp.broadcast_to(1 / mass.astype(dtype), self.particles)
         self.alive = jnp.ones(self.particles, bool) if alive is None else alive
         self.row = (collisions.capacity or ROW) if collisions.pairs == "near" else 0
-        pairs = () if self.row else collisions.pairs
-        self.i, self.j = (jnp.asarray(k) for k in np.array(pairs, np.int32).reshape(-1, 2).T)
-        self.listed = jnp.ones(len(self.i), bool)
+        if not self.row:
+            i, j = (jnp.asarray(k) for k in np.array(collisions.pairs, np.int32).reshape(-1, 2).T)
+            self._follow(i, j, jnp.ones(len(i), bool))
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
         self.resting: Array | bool = False  # (contact,), which are held from the start of the step
@@ -85,6 +95,17 @@ class Contacts:
         names, self.particles, self.dim, self.row, self.axis = kept
         vars(self).update(zip(names, values, strict=True))
         return self
+
+    def _follow(self, i: Array, j: Array, listed: Array) -> None:
+        """Have these pairs, (pair,), and what is known of them before they move."""
+        self.i, self.j, self.listed = i, j, listed
+        first, second = rows(self.inverse_mass, i), rows(self.inverse_mass, j)
+        both = first + second
+        response = where(both > 0, both, 1)
+        self.parts = first / response, -second / response
+        wall = jnp.tile(self.alive & (self.inverse_mass > 0), len(self.colliders))
+        self.possible = jnp.concatenate([wall, listed & rows(self.alive, i) & rows(self.alive, j) & (both > 0)])
+        self.reach = self.both(jnp.add, self.radius)
 
     @property
     def walls(self) -> int:
@@ -145,29 +166,29 @@ class Contacts:
         reaches = 4 * jnp.max(way) * 0.5 ** jnp.arange(NARROWER, dtype=apart.dtype)
         numbers = jnp.sum((apart <= reaches[:, None]) & alive, axis=1)
         widest = jnp.argmax(numbers <= capacity)  # the widest reach that has room; without any, the narrowest
-        widest = jnp.where(jnp.any(numbers <= capacity), widest, NARROWER - 1)
+        widest = where(jnp.any(numbers <= capacity), widest, NARROWER - 1)
         kept = jnp.nonzero((apart <= reaches[widest]) & alive, size=capacity, fill_value=0)[0]
         number = jnp.minimum(numbers[widest], capacity)
         self.left_out = (numbers[0] - number).astype(jnp.int32)
-        self.i, self.j = self.i[kept], self.j[kept]
-        self.listed = jnp.arange(capacity) < number
+        self._follow(rows(self.i, kept), rows(self.j, kept), jnp.arange(capacity) < number)
 
     def _find(self, path: Path, capacity: int) -> None:
         """The pairs of all balls that can meet in this step, by a list of cells; those beyond the rows are counted."""
         n, capacity = self.particles, min(capacity, self.particles * (self.particles - 1) // 2)
         x, way, radius = lax.stop_gradient((path.x, length(path.way) + length(path.bend), self.radius))
-        way = 4 * jnp.max(jnp.where(self.alive & jnp.isfinite(way), way, 0), initial=0)
-        coarse = 1e-6 * jnp.max(jnp.where(jnp.isfinite(x), jnp.abs(x), 0), initial=1e-30)  # cells are counted by int32
+        way = 4 * jnp.max(where(self.alive & jnp.isfinite(way), way, 0), initial=0)
+        coarse = 1e-6 * jnp.max(where(jnp.isfinite(x), jnp.abs(x), 0), initial=1e-30)  # cells are counted by int32
         reach = jnp.maximum(2 * jnp.max(radius, initial=0) + way, coarse)
-        rows, missed = rows_of_neighbours(x, self.alive, 1.001 * reach, self.row, self.row // 2 + 4, None)
-        i, j = jnp.broadcast_to(jnp.arange(n)[:, None], rows.shape), jnp.maximum(jnp.sort(rows, axis=1), 0)
+        others, missed = rows_of_neighbours(x, self.alive, 1.001 * reach, self.row, self.row // 2 + 4, None)
+        i, j = jnp.broadcast_to(jnp.arange(n)[:, None], others.shape), jnp.maximum(jnp.sort(others, axis=1), 0)
         moves = self.inverse_mass[i] + self.inverse_mass[j] > 0
         wanted = (j > i) & moves & (length(x[i] - x[j]) - radius[i] - radius[j] <= way)
         number = jnp.sum(wanted, dtype=jnp.int32)
         kept = jnp.nonzero(wanted.ravel(), size=capacity, fill_value=0)[0]
-        self.listed = jnp.arange(capacity) < number
+        listed = jnp.arange(capacity) < number
         self.left_out = missed + jnp.maximum(number - capacity, 0)
-        self.i, self.j = (jnp.where(self.listed, k.ravel()[kept], none) for k, none in ((i, 0), (j, 1)))
+        i, j = (where(listed, k.ravel()[kept], none) for k, none in ((i, 0), (j, 1)))
+        self._follow(i, j, listed)
 
     def convex(self) -> Array:
         """Where the gap is a convex function of the place of the first partner relative to the second."""
@@ -179,62 +200,59 @@ class Contacts:
         walls = np.repeat([not isinstance(collider, Plane) for collider in self.colliders], self.particles)
         return jnp.concatenate([jnp.asarray(walls, bool), jnp.ones(len(self.i), bool)])
 
-    def possible(self) -> Array:
-        """Which contacts can occur: both partners are alive, and one of them can move."""
-        wall = jnp.tile(self.alive & (self.inverse_mass > 0), len(self.colliders))
-        moves = self.inverse_mass[self.i] + self.inverse_mass[self.j] > 0
-        return jnp.concatenate([wall, self.listed & self.alive[self.i] & self.alive[self.j] & moves])
-
     def first(self, y: Array) -> Array:
         """y of the first partner of each contact, y being (particle, ...)."""
-        return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i]] if len(self.i) else [])])
+        return jnp.concatenate([*[y] * len(self.colliders), *([rows(y, self.i)] if len(self.i) else [])])
 
     def second(self, y: Array) -> Array:
         """What the second partner of each contact has of y; 0 for a collider."""
         walls = jnp.zeros((self.walls, *y.shape[1:]), y.dtype)
-        return jnp.concatenate([walls, y[self.j]]) if len(self.j) else walls
+        return jnp.concatenate([walls, rows(y, self.j)]) if len(self.j) else walls
 
     def relative(self, y: Array) -> Array:
         """y of the first partner less that of the second; of a particle at a collider just y."""
-        return jnp.concatenate([*[y] * len(self.colliders), *([y[self.i] - y[self.j]] if len(self.i) else [])])
+        return jnp.concatenate(
+            [*[y] * len(self.colliders), *([rows(y, self.i) - rows(y, self.j)] if len(self.i) else [])]
+        )
 
     def both(self, join: Callable[[Array, Array], Array], y: Array) -> Array:
         """join(y of the first, y of the second), where there is no second y of the first; y is (particle,)."""
-        return jnp.concatenate([*[y] * len(self.colliders), *([join(y[self.i], y[self.j])] if len(self.i) else [])])
+        return jnp.concatenate(
+            [*[y] * len(self.colliders), *([join(rows(y, self.i), rows(y, self.j))] if len(self.i) else [])]
+        )
 
     def gather(self, first: Array, second: Array) -> Array:
         """The sums (particle, ...) of what contacts add to the first and take from the second partner."""
-        total = jnp.zeros((self.particles, *first.shape[1:]), first.dtype)
-        for k in range(len(self.colliders)):
-            total = total + first[k * self.particles : (k + 1) * self.particles]
+        total = self._of_walls(first)
         if len(self.i):
-            total = total.at[self.i].add(first[self.walls :]).at[self.j].add(-second[self.walls :])
+            total = total.at[self.i].add(first[self.walls :], **THERE)
+            total = total.at[self.j].add(-second[self.walls :], **THERE)
         return total
+
+    def _of_walls(self, change: Array) -> Array:
+        """The sums (particle, ...) of what contacts with colliders add."""
+        walls = [self._of_wall(k, change) for k in range(len(self.colliders))]
+        return sum(walls[1:], walls[0]) if walls else jnp.zeros((self.particles, *change.shape[1:]), change.dtype)
 
     def of_colliders(self, change: Array) -> Array:
         """What each collider adds to each particle, (collider, particle, dim); none where there are no others."""
         walls = 0 if self.alone else self.walls
         own = change[:walls].reshape(-1, self.particles, self.dim)
-        return jnp.where((self.inverse_mass > 0)[:, None], own, 0)
+        return where((self.inverse_mass > 0)[:, None], own, 0)
 
     def move(self, change: Array) -> Array:
         """The changes (particle, ...) by impulses that change the relative velocity by (contact, ...) if alone."""
-        movable = self.inverse_mass > 0
-        total = jnp.zeros((self.particles, *change.shape[1:]), change.dtype)
-        for k in range(len(self.colliders)):
-            total = total + change[k * self.particles : (k + 1) * self.particles]
-        total = jnp.where(movable.reshape(-1, *[1] * (change.ndim - 1)), total, 0)
+        walls = self._of_walls(change)
+        total = where((self.inverse_mass > 0)[:, None], walls, 0) if self.colliders else walls
         if len(self.i):
-            first, second = self.inverse_mass[self.i], self.inverse_mass[self.j]
-            response = jnp.where(first + second > 0, first + second, 1)
             pairs = change[self.walls :]
-            for body, part in ((self.i, first / response), (self.j, -second / response)):
-                total = total.at[body].add(part.reshape(-1, *[1] * (change.ndim - 1)) * pairs)
+            for body, part in zip((self.i, self.j), self.parts, strict=True):
+                total = total.at[body].add(part[:, None] * pairs, **THERE)
         return total
 
     def close(self, active: Array, gap: Array) -> Array:
         """Who touches, or may be pushed into, (contact,)."""
-        return active | (self.possible() & (gap < 0.1 * self.both(jnp.add, self.radius)))
+        return active | (self.possible & (gap < 0.1 * self.reach))
 
     def rate(self, of: Array) -> Array:
         """One over the number of these contacts, (contact,), that the partner with more of them has."""
@@ -252,37 +270,49 @@ class Contacts:
         none = jnp.full(self.walls, self.particles, jnp.int32)  # a collider is one more particle, which stays
         i = jnp.concatenate([jnp.tile(body, len(self.colliders)), self.i.astype(jnp.int32)])
         j = jnp.concatenate([none, self.j.astype(jnp.int32)])
-        i, j = (jnp.where(kept < self.count, k[kept], self.particles) for k in (i, j))
+        i, j = (where(kept < self.count, k[kept], self.particles) for k in (i, j))
         return Chosen(i, j, jnp.pad(self.inverse_mass, (0, 1)), self.friction, self.dt, kept < self.count), kept
 
     def look(self, path: Path, s: Array) -> Look:
         """Gap, normal and relative motion of each contact, with its partners where they are at its own s."""
         parts = [self._look_at_collider(k, path, s) for k in range(len(self.colliders))]
         if len(self.i):
-            parts.append(self._look_at_pairs(path, s[self.walls :]))
+            x, speed = self._balls(path, s)
+            distance, normal = direction(x)
+            gap = distance[:, 0] - self.reach[self.walls :]
+            parts.append(Look(gap, jnp.sum(normal * speed, axis=-1), normal, jnp.zeros_like(gap), speed))
         return Look(*map(jnp.concatenate, zip(*parts, strict=True)))
 
+    def gap(self, path: Path, s: Array) -> Array:
+        """The gap of each contact alone, (contact,)."""
+        parts = []
+        for k, collider in enumerate(self.colliders):
+            own = self._of_wall(k, s)
+            parts.append(jax.vmap(collider)(self.t0 + own * self.dt, path.position(own) + self.lift[k]) - self.radius)
+        if len(self.i):
+            parts.append(length(self._balls(path, s)[0]) - self.reach[self.walls :])
+        return jnp.concatenate(parts)
+
+    def _of_wall(self, k: int, y: Array) -> Array:
+        """What contacts with this collider have of y, (contact, ...)."""
+        return y[k * self.particles : (k + 1) * self.particles]
+
     def _look_at_collider(self, k: int, path: Path, s: Array) -> Look:
-        s = s[k * self.particles : (k + 1) * self.particles]
+        s = self._of_wall(k, s)
         x, speed = path.position(s) + self.lift[k], path.speed(s)
         of_both = jax.vmap(jax.value_and_grad(self.colliders[k], argnums=(0, 1)))
         distance, (recession, slope) = of_both(self.t0 + s * self.dt, x)
         along = jnp.sum(slope * speed, axis=-1) + self.dt * recession
         return Look(distance - self.radius, along, unit(slope), recession, speed)
 
-    def _look_at_pairs(self, path: Path, s: Array) -> Look:
+    def _balls(self, path: Path, s: Array) -> tuple[Array, Array]:
+        """Place and dx/ds of the first ball of each pair relative to the second, (pair, dim), at its own s."""
         table = jnp.concatenate([path.x, path.way, path.bend, path.s[:, None]], axis=1)
-
-        def ball(k):
-            x, way, bend, since = jnp.split(table[k], [self.dim, 2 * self.dim, 3 * self.dim], axis=1)
-            part = s[:, None] - since
-            return x + part * (way + part / 2 * bend), way + part * bend
-
-        (x, speed), (y, other) = ball(self.i), ball(self.j)
-        distance, normal = direction(x - y)
-        along = jnp.sum(normal * (speed - other), axis=-1)
-        gap = distance[:, 0] - self.radius[self.i] - self.radius[self.j]
-        return Look(gap, along, normal, jnp.zeros_like(gap), speed - other)
+        both = rows(table, jnp.stack([self.i, self.j]))
+        x, way, bend, since = jnp.split(both, [self.dim, 2 * self.dim, 3 * self.dim], axis=2)
+        part = s[self.walls :, None] - since
+        place, speed = x + part * (way + part / 2 * bend), way + part * bend
+        return place[0] - place[1], speed[0] - speed[1]
 
     def roundoff(self, x: Array) -> Array:
         """How large a gap of zero may come out by roundoff, (contact,), m."""
@@ -305,7 +335,7 @@ class Contacts:
         touching = (gap <= small)[:, None]
         for k, own in enumerate(walls):
             others = [
-                jnp.where(
+                where(
                     touching[m] & (jnp.sum(normal[m] * normal[own], axis=-1, keepdims=True) > -1e-3),
                     LIFT / TOUCH * small[m][:, None] * normal[m],
                     0,
@@ -342,18 +372,20 @@ class Chosen(NamedTuple):
 
     def rate(self, of: Array) -> Array:
         one = of.astype(self.dt.dtype)
-        number = jnp.zeros_like(self.inverse_mass).at[self.i].add(one).at[self.j].add(one).at[-1].set(0)
-        return 1 / jnp.maximum(jnp.maximum(number[self.i], number[self.j]), 1)
+        number = (
+            jnp.zeros_like(self.inverse_mass).at[self.i].add(one, **THERE).at[self.j].add(one, **THERE).at[-1].set(0)
+        )
+        return 1 / jnp.maximum(jnp.maximum(rows(number, self.i), rows(number, self.j)), 1)
 
     def relative(self, y: Array) -> Array:
         y = jnp.pad(y, ((0, 1), *[(0, 0)] * (y.ndim - 1)))
-        return y[self.i] - y[self.j]
+        return rows(y, self.i) - rows(y, self.j)
 
     def move(self, change: Array) -> Array:
-        first, second = self.inverse_mass[self.i], self.inverse_mass[self.j]
-        response = jnp.where(first + second > 0, first + second, 1)
+        first, second = rows(self.inverse_mass, self.i), rows(self.inverse_mass, self.j)
+        response = where(first + second > 0, first + second, 1)
         shares = (part.reshape(-1, *[1] * (change.ndim - 1)) for part in (first / response, second / response))
         total = jnp.zeros((len(self.inverse_mass), *change.shape[1:]), change.dtype)
         for body, part in zip((self.i, self.j), shares, strict=True):
-            total = total.at[body].add((part if body is self.i else -part) * change)
+            total = total.at[body].add((part if body is self.i else -part) * change, **THERE)
         return total[:-1]

@@ -13,15 +13,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jeuler._core.vectors import length, unit
+from jeuler._core.choice import where
+from jeuler._core.vectors import direction, length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
-from jeuler.contact.contacts import TOUCH, Contacts, Look
+from jeuler.contact.contacts import THERE, Contacts, Look, rows
 from jeuler.contact.paths import Path, along
-
-MAX_STRIDES = 400  # along one path; one that grazes a surface that is not known to be convex needs many
-NEWTON_STEPS = 32  # where the approach begins at 0 each only halves the way to the root
-GRAZING = 4  # square roots of a unit in the last place: an approach in parts of the speed that rounding can make or end
+from jeuler.contact.search import Found, next_impacts, rounding, rounding_of_speed
 
 
 class Events(NamedTuple):
@@ -33,119 +31,18 @@ class Events(NamedTuple):
     plastic: Array  # (particle,), whether it stays: too slow an approach for restitution
 
 
-class Found(NamedTuple):
-    """The next impact of each contact, if it were alone."""
-
-    s: Array  # (contact,), inf for none
-    at_root: Array
-    plastic: Array
-    unclear: Array  # whether the search was given up, or found a path that grazes within rounding: no time of impact
-    look: Look  # at s
-
-
 def bounce(v: Array, normal: Array, restitution: Any, friction: Any) -> Array:
     """The change of the relative velocity by an impact: Newton's restitution and Coulomb's friction.
 
     v_n -> -restitution v_n,   |change of v_t| <= friction |change of v_n|,   against v_t
     """
     v_n = jnp.sum(v * normal, axis=-1)
-    push = -(1 + restitution) * jnp.where(v_n < 0, v_n, 0)
+    push = -(1 + restitution) * where(v_n < 0, v_n, 0)
     v_t = v - v_n[..., None] * normal
     speed = length(v_t)
     held = friction * push > speed  # strictly: friction 0 holds nothing
-    lost = jnp.where(held, 1, friction * push / jnp.where(held | (speed == 0), 1, speed))
+    lost = where(held, 1, friction * push / where(held | (speed == 0), 1, speed))
     return push[..., None] * normal - lost[..., None] * v_t
-
-
-def rounding_of_speed(contacts: Contacts, path: Path) -> Array:
-    """What a speed of approach of 0 may look like, m a step."""
-    eps = jnp.finfo(path.x.dtype).eps
-    return contacts.both(jnp.add, 4 * eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1)))
-
-
-def impulsive_limit(contacts: Contacts, normal: Array, path: Path) -> Array:
-    """The speed of approach, m a step, up to which an impact is one that the step itself can make: it is plastic.
-
-    Among many contacts each partner may be held by others, so that the forces on the other one make it.
-    """
-    if contacts.many:
-        made = contacts.both(jnp.add, length(path.bend))
-    else:
-        made = jnp.abs(jnp.sum(contacts.relative(path.bend) * normal, axis=-1))
-    return 1.001 * made + rounding_of_speed(contacts, path)
-
-
-def convex_stride(gap: Array, slope: Array, bend: Array) -> Array:
-    """How far a gap that would be convex on a straight path is above 0 on one that bends by at most this much.
-
-    The root of  gap + slope h - bend h^2 / 2,  for gap and bend >= 0.
-    """
-    root = jnp.sqrt(slope**2 + 2 * bend * gap)
-    falls = slope < 0
-    down = 2 * gap / jnp.where(falls, root - slope, 1)
-    up = (root + slope) / jnp.where(bend > 0, bend, 1)
-    return jnp.where(falls, down, jnp.where(bend > 0, up, 2))
-
-
-def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
-    """The next impact of each contact along the paths as they are now.
-
-    Strides of the length of the gap, which cannot cross a surface (J. C. Hart, Sphere tracing, 1996), or longer ones
-    where the solid is convex, up to near it; then Newton's method. Who touches and approaches is at an impact now; its
-    root is close by, or in the past.
-    """
-    start = contacts.both(jnp.maximum, path.s)
-    small = contacts.roundoff(path.x)
-    first = contacts.look(path, start)
-    limit = impulsive_limit(contacts, first.normal, path) + slow
-    rests = contacts.resting & ~contacts.both(jnp.logical_or, path.hit)  # still as it was held from the start
-    none = small + jnp.where(rests, contacts.open(slow), 0)
-    touching = first.gap <= none
-    held = jnp.inf if contacts.many else limit
-    now = touching & (-first.slope > jnp.where(rests, held, rounding_of_speed(contacts, path) + slow))
-    lowest = jnp.where(now, start - 1, start)
-    turn = length(contacts.relative(path.bend))
-    fastest = length(first.speed) + turn
-    stride = fastest + jnp.abs(first.recession) * contacts.dt
-    safe_stride = jnp.where(stride > 0, stride, 1)
-    convex = contacts.convex()
-    searched = contacts.possible() & (now | (first.gap <= stride))
-
-    def go_on(state):
-        s, _, _, newtons, n = state
-        return jnp.any(searched & (newtons < NEWTON_STEPS) & (s <= 1)) & (n < MAX_STRIDES)
-
-    def advance(state):
-        s, look, apart, newtons, n = state
-        gap, slope = look.gap, look.slope
-        far = apart & ((gap > 1e-3 * stride) | (slope >= 0)) & (gap > 0) & (newtons == 0)
-        longer = convex_stride(jnp.maximum(gap, 0), slope, turn)
-        not_too_slow = jnp.where(slope >= 0, jnp.minimum(0.02, longer), 0)  # away from a surface of any form
-        ahead = jnp.minimum(jnp.maximum(gap / safe_stride, jnp.where(convex, longer, not_too_slow)), 2)
-        falls = slope < 0
-        latest = jnp.where(s < 1, 1, 2)  # where the gap only begins to fall, Newton's step goes too far
-        root = jnp.clip(s - gap / jnp.where(falls, slope, -1), lowest, latest)
-        s = jnp.where(n == 0, s, jnp.where(far, s + ahead, jnp.where(falls, root, s)))
-        newtons = newtons + jnp.where((n > 0) & ~far, 1, 0)
-        look = contacts.look(path, s)
-        newtons = jnp.where((newtons > 0) & (jnp.abs(look.gap) <= small / TOUCH), NEWTON_STEPS, newtons)
-        apart = jnp.where(n == 0, ~now & (look.gap > none), apart)
-        return s, look, apart, jnp.where(now | apart, newtons, NEWTON_STEPS), n + 1
-
-    begin = start + jnp.where(touching & ~now, 1e-3, 0)  # who leaves may come back
-    state = begin, first, now, jnp.zeros(contacts.count, jnp.int32), 0
-    s, look, apart, newtons, _ = lax.while_loop(go_on, advance, state)
-    given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
-    at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small - 1e-6 * look.slope) & (s > lowest)
-    given_up = given_up | (searched & apart & ~at_root & (s <= 1) & (look.gap < -small))
-    by_rest = rests & (s - 2 * small / jnp.where(at_root, look.slope, -1) >= 1)  # the gap that its solve has closed
-    happens = searched & (now | (apart & at_root & (s <= 1) & ~by_rest))
-    overlap = now & ~at_root
-    look = jax.tree.map(lambda x, y: jnp.where(overlap if x.ndim == 1 else overlap[:, None], x, y), first, look)
-    s = jnp.where(overlap, start, s)
-    glancing = GRAZING * jnp.sqrt(jnp.finfo(s.dtype).eps) * length(first.speed)
-    grazes = happens & ~now & (-look.slope <= glancing) & (jnp.arange(contacts.count) >= contacts.walls)
-    return Found(jnp.where(happens, s, jnp.inf), at_root, -look.slope <= limit, given_up | grazes, look)
 
 
 def choose(contacts: Contacts, found: Found) -> Events:
@@ -153,26 +50,28 @@ def choose(contacts: Contacts, found: Found) -> Events:
     n, numbers = contacts.particles, jnp.arange(contacts.count)
     i, j, pairs = contacts.i, contacts.j, slice(contacts.walls, None)
 
+    def at_both(value, least):
+        return value.at[i].min(least, **THERE).at[j].min(least, **THERE)
+
     def least(per_contact, initial):
         value = jnp.min(per_contact[: contacts.walls].reshape(-1, n), axis=0, initial=initial)
-        return value.at[i].min(per_contact[pairs]).at[j].min(per_contact[pairs]) if len(i) else value
+        return at_both(value, per_contact[pairs]) if len(i) else value
 
     first = least(found.s, jnp.inf)
     if len(i):
-        between = jnp.where(contacts.listed, jnp.minimum(first[i], first[j]), jnp.inf)
-        first = first.at[i].min(between).at[j].min(between)
+        first = at_both(first, where(contacts.listed, jnp.minimum(rows(first, i), rows(first, j)), jnp.inf))
     now = jnp.isfinite(found.s) & (found.s <= contacts.both(jnp.minimum, first))
-    rank = jnp.where(now, numbers, contacts.count)
+    rank = where(now, numbers, contacts.count)
     winner = least(rank, contacts.count)
-    chosen = jnp.where(winner < contacts.walls, winner, contacts.count)
+    chosen = where(winner < contacts.walls, winner, contacts.count)
     if len(i):  # a pair goes on only if it is the first of both
-        agreed = now[pairs] & (winner[i] == rank[pairs]) & (winner[j] == rank[pairs])
-        number = jnp.where(agreed, rank[pairs], contacts.count)
-        chosen = chosen.at[i].min(number).at[j].min(number)
+        agreed = now[pairs] & (rows(winner, i) == rank[pairs]) & (rows(winner, j) == rank[pairs])
+        chosen = at_both(chosen, where(agreed, rank[pairs], contacts.count))
     there = chosen < contacts.count
-    of = jnp.where(there, chosen, 0)
-    contact = jnp.where(there, chosen, -1).astype(jnp.int32)
-    return Events(contact, jnp.where(there, found.s[of], 0), there & found.at_root[of], there & found.plastic[of])
+    of = where(there, chosen, 0)
+    contact = where(there, chosen, -1).astype(jnp.int32)
+    s, at_root, plastic = (rows(y, of) for y in (found.s, found.at_root, found.plastic))
+    return Events(contact, where(there, s, 0), there & at_root, there & plastic)
 
 
 def meet(contacts: Contacts, path: Path, events: Events) -> tuple[Array, Look]:
@@ -184,9 +83,9 @@ def meet(contacts: Contacts, path: Path, events: Events) -> tuple[Array, Look]:
     at_root = met(contacts, events) & contacts.first(events.at_root)
 
     def gap(s):
-        return jnp.where(at_root, contacts.look(path, s).gap, s - start)
+        return where(at_root, contacts.gap(path, s), s - start)
 
-    known = jnp.where(at_root, contacts.first(events.s), start)
+    known = where(at_root, contacts.first(events.s), start)
     s, _ = root(gap, known, lambda _, s: (s, ()), lambda slope, b: b / slope(jnp.ones_like(b)))
     return s, contacts.look(path, s)
 
@@ -201,32 +100,32 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     now, plastic = met(contacts, events), contacts.first(events.plastic)
     normal, bend = look.normal, contacts.relative(path.bend)
     v = look.speed / contacts.dt + look.recession[:, None] * normal
-    change = bounce(v, normal, jnp.where(plastic, 0, contacts.restitution), contacts.friction)
+    change = bounce(v, normal, where(plastic, 0, contacts.restitution), contacts.friction)
     into = jnp.sum(bend * normal, axis=-1)
     stays = plastic & (into < rounding_of_speed(contacts, path))  # without a push too, as where a solve holds it
-    held = jnp.where(stays, -into, 0)[:, None] * normal  # no more push into what it stays on
+    held = where(stays, -into, 0)[:, None] * normal  # no more push into what it stays on
 
     zero = jnp.zeros_like(change)
-    kick = contacts.move(jnp.where(now[:, None], change, zero))
-    hold = shared(contacts, path, normal, jnp.where(now[:, None], held, zero))
+    kick = contacts.move(where(now[:, None], change, zero))
+    hold = shared(contacts, path, normal, where(now[:, None], held, zero))
     own_s = spread(contacts, path.s, s, now)
     hit = (events.contact >= 0)[:, None]
     late = (1 - own_s)[:, None] + 0.5 - theta
-    speed = jnp.where(hit, path.speed(own_s) + contacts.dt * kick, path.way)
+    speed = where(hit, path.speed(own_s) + contacts.dt * kick, path.way)
     off = hit & leaves_its_support(path, own_s, speed)
-    hold = hold - jnp.where(off, path.support, 0)
+    hold = hold - where(off, path.support, 0)
     support = path.support + hold
-    new = jnp.abs(along(hold, support)) > 1e-6 * (length(path.bend) + length(path.support))
+    new = jnp.abs(along(hold, support)) > 1e-6 * sum(path.sizes()[1:])
     return Path(
         own_s,
-        jnp.where(hit, path.position(own_s), path.x),
+        where(hit, path.position(own_s), path.x),
         speed,
         path.bend + hold,
         path.jump + kick + late * hold / contacts.dt,
         path.hit | hit[:, 0],
         support,
-        jnp.where(new, along(speed, support), path.ride),
-        jnp.where(off, 0, path.ground) + contacts.of_colliders(jnp.where(now[:, None], held, zero)),
+        where(new, along(speed, support), path.ride),
+        where(off, 0, path.ground) + contacts.of_colliders(where(now[:, None], held, zero)),
     )
 
 
@@ -238,39 +137,39 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
     """
     if contacts.alone:
         return contacts.gather(change, change)
-    least = 1e-6 * (length(path.bend) + length(path.support))  # of a push; what is less is left by iterations
-    colliders = [unit(jnp.where((length(ground) > least)[:, None], ground, 0)) for ground in path.ground]
-    on_balls = length(path.support) > least
-    for upward in colliders:
-        on_balls = on_balls & jnp.all(upward == 0, axis=-1)
+    _, bend, support = path.sizes()
+    least = 1e-6 * (bend + support)  # of a push; what is less is left by iterations
+    size, upward = direction(path.ground)
+    upward = where(size > least[:, None], upward, 0)
+    on_balls = (support > least) & ~jnp.any(upward != 0, axis=(0, 2))
+    towards = jnp.stack([normal, -normal])
 
-    def response(of, towards):
-        """What a push of 1 along ``towards`` does to a particle, (contact, dim)."""
-        push = towards
-        for upward in [of(up) for up in (*colliders, *colliders[:-1])]:
-            push = push - jnp.minimum(jnp.sum(upward * push, axis=-1, keepdims=True), 0) * upward
-        support = of(path.support)
-        stays = of(on_balls) & (jnp.sum(support * towards, axis=-1) < -0.5 * length(support))
-        return jnp.where(stays[:, None], 0, push * of(contacts.inverse_mass)[:, None])
+    def of(y):
+        return jnp.stack([contacts.first(y), contacts.second(y)])
 
-    first, second = response(contacts.first, normal), response(contacts.second, -normal)
+    response = towards  # what a push of 1 along these does to each partner, (2, contact, dim)
+    colliders = [of(up) for up in upward]
+    for up in (*colliders, *colliders[:-1]):
+        response = response - jnp.minimum(jnp.sum(up * response, axis=-1, keepdims=True), 0) * up
+    stays = of(on_balls) & (jnp.sum(of(path.support) * towards, axis=-1) < -0.5 * of(support))
+    first, second = where(stays[..., None], 0, response * of(contacts.inverse_mass)[..., None])
     both = jnp.sum((first - second) * normal, axis=-1, keepdims=True)
     moves = both > 1e-6 * contacts.both(jnp.add, contacts.inverse_mass)[:, None]
-    push = jnp.sum(change * normal, axis=-1, keepdims=True) * jnp.where(moves, 1 / jnp.where(moves, both, 1), 0)
+    push = jnp.sum(change * normal, axis=-1, keepdims=True) * where(moves, 1 / where(moves, both, 1), 0)
     return contacts.gather(push * first, -push * second)
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:
     """Whether a particle with this dx/ds at s goes off what held it and does not fall back in this step."""
-    excess, rounding = off_its_support(path, s, speed)
-    return (excess > rounding)[:, None]
+    excess, small = off_its_support(path, s, speed)
+    return (excess > small)[:, None]
 
 
 def off_its_support(path: Path, s: Array, speed: Array) -> tuple[Array, Array]:
     """By how much dx/ds, m a step, is more than what falls back in this step; and what of that may be rounding."""
-    falls_back = 0.5 * (1 - s) * length(path.support)
-    rounding = 16 * jnp.finfo(s.dtype).eps * (length(path.way) + jnp.max(jnp.abs(path.x), axis=-1))
-    return along(speed, path.support) - path.ride - falls_back, rounding
+    _, _, support = path.sizes()
+    falls_back = 0.5 * (1 - s) * support
+    return along(speed, path.support) - path.ride - falls_back, 16 * rounding(path)
 
 
 def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Array:
@@ -278,11 +177,11 @@ def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Arra
     n = contacts.particles
     for k in range(len(contacts.colliders)):
         own = slice(k * n, (k + 1) * n)
-        y = jnp.where(met[own], per_contact[own], y)
+        y = where(met[own], per_contact[own], y)
     if len(contacts.i):
         pairs = per_contact[contacts.walls :]
         for body in (contacts.i, contacts.j):
-            y = y.at[jnp.where(met[contacts.walls :], body, n)].set(pairs, mode="drop")
+            y = y.at[where(met[contacts.walls :], body, n)].set(pairs, mode="drop", wrap_negative_indices=False)
     return y
 
 
@@ -335,15 +234,15 @@ def of_an_order(contacts: Contacts, path: Path, after: Path, events: Events, fou
     """Which impacts, (contact,), that were not chosen are at the same time, within rounding, as one of their partners'
     that was chosen, and another one after it: what happens depends on an order that rounding decides."""
     look, chosen = found.look, events.contact >= 0
-    earliest = contacts.both(jnp.minimum, jnp.where(chosen, events.s, jnp.inf))
-    small = 2 * contacts.roundoff(path.x) / jnp.where(look.slope < 0, -look.slope, jnp.inf)
+    earliest = contacts.both(jnp.minimum, where(chosen, events.s, jnp.inf))
+    small = 2 * contacts.roundoff(path.x) / where(look.slope < 0, -look.slope, jnp.inf)
     together = jnp.isfinite(found.s) & (found.s <= earliest + small) & ~met(contacts, events)
     change = contacts.relative(after.jump - path.jump)
     into = jnp.sum(change * look.normal, axis=-1)
     along = length(change - into[:, None] * look.normal)
     curved = contacts.curved()  # the speed along a curved surface is one into it from beside
     of_chosen = contacts.both(jnp.logical_or, chosen & curved[events.contact])
-    noticed = jnp.abs(into) + jnp.where((contacts.friction > 0) | curved | of_chosen, along, 0)
+    noticed = jnp.abs(into) + where((contacts.friction > 0) | curved | of_chosen, along, 0)
     walls = jnp.arange(contacts.count) < contacts.walls
     same = walls & contacts.first(chosen & (events.contact < contacts.walls))  # of two flush surfaces the order is one
     same = same & (jnp.sum(contacts.first(look.normal[events.contact]) * look.normal, axis=-1) > 1 - 1e-4)
@@ -352,21 +251,20 @@ def of_an_order(contacts: Contacts, path: Path, after: Path, events: Events, fou
 
 def may_leave(path: Path, after: Path, events: Events) -> Array:
     """Which particles, (particle,), an impact takes off what held them or not, as rounding decides."""
-    excess, rounding = off_its_support(path, after.s, after.way)
+    excess, small = off_its_support(path, after.s, after.way)
     moved = jnp.abs(along(after.way, path.support) - path.ride)
-    return (events.contact >= 0) & (jnp.abs(excess) <= 4 * rounding) & (moved > 1e-3 * length(path.support))
+    return (events.contact >= 0) & (jnp.abs(excess) <= 4 * small) & (moved > 1e-3 * length(path.support))
 
 
-def by_chance(contacts: Contacts, path: Path, events: Events, slow: Array) -> Array:
+def by_chance(contacts: Contacts, path: Path, events: Events, end: Look, slow: Array) -> Array:
     """Which contacts, (contact,), the impacts of a step leave touching without a load or a motion against each other.
 
     Not those whose own plastic impact makes them so: whether the others part or press from then on, rounding decides.
     """
-    end = contacts.look(path, jnp.ones_like(slow))
-    touches = (end.gap <= contacts.roundoff(path.x) + contacts.open(slow)) & contacts.possible()
+    touches = (end.gap <= contacts.roundoff(path.x) + contacts.open(slow)) & contacts.possible
     still = jnp.abs(end.slope) <= slow + rounding_of_speed(contacts, path)
     number = jnp.arange(len(events.contact))[:, None]
-    last = jnp.argmax(jnp.where(events.contact >= 0, number, -1), axis=0)
+    last = jnp.argmax(where(events.contact >= 0, number, -1), axis=0)
     contact, plastic = (jnp.take_along_axis(y, last[None], axis=0)[0] for y in (events.contact, events.plastic))
     numbers = jnp.arange(contacts.count)
     own = (contacts.both(jnp.minimum, contact) == numbers) & (contacts.both(jnp.maximum, contact) == numbers)
@@ -381,7 +279,7 @@ def may_stick(contacts: Contacts, events: Events, found: Found) -> Array:
     v, normal = found.look.speed / contacts.dt, found.look.normal
     v_n = jnp.sum(v * normal, axis=-1) + found.look.recession
     along = length(v - jnp.sum(v * normal, axis=-1)[:, None] * normal)
-    restitution = jnp.where(contacts.first(events.plastic), 0, contacts.restitution)
+    restitution = where(contacts.first(events.plastic), 0, contacts.restitution)
     most = contacts.friction * (1 + restitution) * jnp.abs(v_n)
     return met(contacts, events) & (jnp.abs(most - along) <= 1e3 * jnp.finfo(along.dtype).eps * most) & (most > 0)
 

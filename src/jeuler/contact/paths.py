@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jeuler._core.vectors import unit
+from jeuler._core.choice import where
+from jeuler._core.vectors import length, unit
 
 SMALL_PART = 1e-6  # of the changes of velocity of a step: one from which nothing is to be read
 
@@ -41,18 +42,23 @@ class Path(NamedTuple):
         part = (s - self.s)[:, None]
         return self.x + part * (self.way + part / 2 * self.bend)
 
+    def sizes(self) -> tuple[Array, Array, Array]:
+        """The lengths of way, bend and support, (particle,), by which it is decided what happens."""
+        return tuple(length(lax.stop_gradient(jnp.stack([self.way, self.bend, self.support]))))
+
     def speed(self, s: Array) -> Array:
         """dx/ds, m a step."""
         return self.way + (s - self.s)[:, None] * self.bend
 
 
-def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = 0.0, ground: Any = None) -> Path:
+def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = None, ground: Any = None) -> Path:
     """The path of a step without impacts; ``kick`` is what of dv contacts give that last through the step, and
     ``ground`` what each collider gives to push against, (collider, particle, dim), m/s."""
-    zero, bend, support = jnp.zeros(len(x), x.dtype), dt * dv, jnp.zeros_like(x) + dt * kick
+    zero, bend = jnp.zeros(len(x), x.dtype), dt * dv
     ground = jnp.zeros((0, *x.shape), x.dtype) if ground is None else dt * ground
     way = displacement - bend / 2
-    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, along(way + bend, support), ground)
+    support, ride = (jnp.zeros_like(x), zero) if kick is None else (dt * kick, along(way + bend, dt * kick))
+    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, ride, ground)
 
 
 def along(y: Array, support: Array) -> Array:
@@ -77,9 +83,9 @@ def share_of_the_force(
     most = dt * jnp.sum(dv * dv, axis=-1, keepdims=True)
     size = jnp.max(jnp.abs(x) + jnp.abs(displacement), axis=-1, keepdims=True)
     clear = dt * most > (16 * jnp.finfo(x.dtype).eps * size) ** 2
-    along, most = jnp.where(clear, along, 0), jnp.where(clear, most, 0)
+    along, most = where(clear, along, 0), where(clear, most, 0)
     of_all = total(most)
-    others = jnp.where(of_all > 0, total(along) / jnp.where(of_all > 0, of_all, 1), 0.5)
+    others = where(of_all > 0, total(along) / where(of_all > 0, of_all, 1), 0.5)
     clear = most > SMALL_PART**2 * of_all
-    part = jnp.where(clear, along / jnp.where(clear, most, 1), others)
+    part = where(clear, along / where(clear, most, 1), others)
     return lax.stop_gradient(jnp.clip(jnp.round(2 * part) / 2, 0, 1))

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from jeuler._core.choice import where
 from jeuler._core.vectors import length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
@@ -74,14 +75,14 @@ class Problem(NamedTuple):
     def project(self, y: Array) -> Array:
         """The impulse nearest to y that pushes, and rubs no more than friction can."""
         y_n = self.push(y)[:, None]
-        push = jnp.where(self.active[:, None] & (y_n > 0), y_n, 0)
+        push = where(self.active[:, None] & (y_n > 0), y_n, 0)
         weak = push <= self.weak()  # which derivative a rounding has is chance: it may be another one if recomputed
-        push = jnp.where(weak, lax.stop_gradient(push), push)
+        push = where(weak, lax.stop_gradient(push), push)
         y_t = y - y_n * self.normal
         size, most = length(y_t)[:, None], self.contacts.friction * push
         held = size < most  # strictly: friction 0 holds nothing
-        rubbed = jnp.where(held, y_t, y_t * (most / jnp.where(held | (size == 0), 1, size)))
-        rubbed = jnp.where(weak, lax.stop_gradient(rubbed), rubbed)  # nor does it hold anything
+        rubbed = where(held, y_t, y_t * (most / where(held | (size == 0), 1, size)))
+        rubbed = where(weak, lax.stop_gradient(rubbed), rubbed)  # nor does it hold anything
         return push * self.normal + rubbed
 
     def at_the_limit(self, w: Array) -> Array:
@@ -132,7 +133,7 @@ class Problem(NamedTuple):
         kick, moved, shift = jnp.split(
             self.contacts.relative(jnp.concatenate([kick, self.theta * kick, shift], axis=1)), 3, axis=1
         )
-        gap = jnp.where(self.active, self.gap + self.push(moved), self.clear)
+        gap = where(self.active, self.gap + self.push(moved), self.clear)
         return self.velocity + kick, gap, gap + self.push(shift)
 
     def better_push(self, w: Array, rate: Array) -> Array:
@@ -147,15 +148,15 @@ class Problem(NamedTuple):
         that gaps that cannot all be 0 at once leave it where it is.
         """
         left = gap + self.push(self.contacts.relative(self.contacts.move(q[:, None] * self.normal)))
-        lowest = jnp.where(pressed, -jnp.maximum(gap, 0), 0)
-        return jnp.where(close, jnp.maximum(q - rate * (left + jnp.where(pressed, 0, small)), lowest), 0)
+        lowest = where(pressed, -jnp.maximum(gap, 0), 0)
+        return where(close, jnp.maximum(q - rate * (left + where(pressed, 0, small)), lowest), 0)
 
     def residual(self, u: Array, rate: Array, on: Array, overlap: Array) -> Array:
         """What is 0 at the answer where the gaps ``on`` are closed, down to an overlap; it has derivatives."""
         w, q = u[:, :-1], u[:, -1]
         velocity, _, left = self.at_end(w, q)
         unmoved = w - self.project(w - rate[:, None] * velocity)
-        return jnp.concatenate([unmoved, jnp.where(on, left + overlap, q)[:, None]], axis=1)
+        return jnp.concatenate([unmoved, where(on, left + overlap, q)[:, None]], axis=1)
 
 
 def at_rest(problem: Problem, small: Array, load: Array | None = None) -> Rest:
@@ -193,7 +194,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         w = problem.project(-problem.velocity)
         gap = problem.gap + problem.push(problem.theta * w)
         on = pressed(w, problem.velocity + w) | lax.stop_gradient(active & (gap < -small))
-        u = jnp.concatenate([w, jnp.where(on, -gap, 0)[:, None]], axis=1)
+        u = jnp.concatenate([w, where(on, -gap, 0)[:, None]], axis=1)
         unresolved = jnp.sum(unclear | lax.stop_gradient(problem.at_the_limit(w))).astype(jnp.int32)
     else:
         rate = contacts.rate(active)
@@ -202,7 +203,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         velocity, gap, _ = problem.at_end(w, q)
         presses = pressed(w, velocity)
         on = lax.stop_gradient(presses | ((q > 0) & ((gap < -small) | ~active)))
-        overlap = jnp.where(presses, 0, small)
+        overlap = where(presses, 0, small)
         u = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
         off = lax.stop_gradient(problem.residual(u, rate, on, overlap))  # Newton's step may have ended it
         off = jnp.minimum(error, jnp.maximum(length(off[:, :-1]) / rate, jnp.abs(off[:, -1])))
@@ -211,7 +212,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     w, q = u[:, :-1], u[:, -1]
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)
-    left = jnp.where(active, contacts.dt * left, 0)
+    left = where(active, contacts.dt * left, 0)
     return Rest(contacts.move(w), w, contacts.dt * shift, on, left, unresolved)
 
 
@@ -233,7 +234,7 @@ def _tolerated(problem: Problem) -> Array:
     """The velocity of a contact, m/s, that counts as none beside those of the problem."""
     speed = length(lax.stop_gradient(problem.velocity))
     rounding = 64 * jnp.finfo(speed.dtype).eps * problem.fastest
-    return 1e-3 * problem.contacts.largest(jnp.where(problem.active, speed, 0)) + rounding
+    return 1e-3 * problem.contacts.largest(where(problem.active, speed, 0)) + rounding
 
 
 def _iterate(problem: Problem, small: Array) -> tuple[Array, Array]:
@@ -272,18 +273,18 @@ def _accelerated(
         u, ahead, weight, _, k = state
         new = better(ahead)
         restart = jnp.sum((ahead - new) * (new - u)) > 0
-        weight = jnp.where(restart, 1.0, weight).astype(start.dtype)
+        weight = where(restart, 1.0, weight).astype(start.dtype)
         next_weight = (1 + jnp.sqrt(1 + 4 * weight**2)) / 2
         change = new - ahead
         error = (length(change) if change.ndim > 1 else jnp.abs(change)) / rate
-        ahead = new + jnp.where(restart, 0, (weight - 1) / next_weight) * (new - u)
+        ahead = new + where(restart, 0, (weight - 1) / next_weight) * (new - u)
         return new, ahead, next_weight, error, k + 1
 
     def go_on(state):
         *_, error, k = state
         return (jnp.max(error, initial=0) > enough) & (k < ITERATIONS)
 
-    error = jnp.where(active, jnp.inf, jnp.zeros_like(rate))
+    error = where(active, jnp.inf, jnp.zeros_like(rate))
     u, _, _, error, _ = lax.while_loop(go_on, one, (start, start, jnp.ones((), start.dtype), error, 0))
     return u, error
 
@@ -304,7 +305,7 @@ def _solve(residual: Callable[[Array], Array], guess: Array, needed: Array) -> A
             new = guess - _solve_linear(slope, value)
             rounding = 1e3 * jnp.finfo(guess.dtype).eps * jnp.max(jnp.abs(guess))
             better = jnp.max(jnp.abs(residual(new))) <= 1e-3 * jnp.max(jnp.abs(value)) + rounding
-            return jnp.where(better, new, guess)
+            return where(better, new, guess)
 
         return lax.cond(needed, step, lambda _: guess, None), ()
 

@@ -11,20 +11,28 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
+from jeuler._core.choice import where
 from jeuler._core.vectors import length
 from jeuler._jax.anywhere import where_needed
 from jeuler._jax.found import found, found_p
-from jeuler.contact.contacts import Contacts, Look
-from jeuler.contact.impacts import by_chance, go_through, impulsive_limit, schedule
+from jeuler.contact.contacts import THERE, Contacts, Look
+from jeuler.contact.impacts import by_chance, go_through, schedule
 from jeuler.contact.paths import Path, free_path, share_of_the_force
 from jeuler.contact.rest import REST, Problem, at_rest, together
+from jeuler.contact.search import impulsive_limit
 
 IMPACTS = "impacts"  # the name of what the search of a step has found
+DECIDED = "decided"  # and of what is decided before it, without a derivative
 
 
 def _kept(primitive: Any, *_: Any, name: str = "", label: str = "", **__: Any) -> bool:
     """What reverse mode keeps of a step: the results of searches and solves; it recomputes the rest."""
-    return name in (IMPACTS, REST) or label == REST or primitive is found_p
+    return name in (IMPACTS, REST, DECIDED) or label == REST or primitive is found_p
+
+
+def decided(x: Array) -> Array:
+    """x, without a derivative, and kept for reverse mode."""
+    return checkpoint_name(lax.stop_gradient(x), DECIDED)
 
 
 @functools.partial(jax.jit, static_argnames="rounds")
@@ -51,7 +59,7 @@ def _resolve(
     contacts: Contacts, x: Array, v: Array, x_free: Array, v_free: Array, rounds: int, load: Array | None
 ) -> tuple[Array, Array, Array]:
     displacement, dv = x_free - x, v_free - v
-    theta = share_of_the_force(x, displacement, v, dv, contacts.dt, contacts.total)
+    theta = decided(share_of_the_force(x, displacement, v, dv, contacts.dt, contacts.total))
     contacts.near(free_path(x, displacement, dv, contacts.dt))
     slow = _slow(contacts, dv)
 
@@ -61,28 +69,35 @@ def _resolve(
     events, after, left, undecided = checkpoint_name(impacts, IMPACTS)
     moved, jump = found(_end(after), lambda: _end(go_through(contacts, path, events, theta)))
     touched = (touched | after.hit)[:, None]
-    position = jnp.where(touched, moved, x_free)
-    velocity = jnp.where(touched, v_end + jump, v_free)
+    position = where(touched, moved, x_free)
+    velocity = where(touched, v_end + jump, v_free)
+    end = None
     if not (contacts.alone or contacts.many):
-        undecided = undecided + jnp.sum(by_chance(contacts, after, events, slow)).astype(jnp.int32)
-    if len(contacts.colliders) > 1 or len(contacts.i):
+        end = at_end(*lax.stop_gradient((contacts, after)))
+        undecided = undecided + jnp.sum(by_chance(contacts, after, events, end, slow)).astype(jnp.int32)
+    if not contacts.alone:
         unchanged = jnp.zeros_like(velocity), jnp.zeros_like(position)
-        operands = lax.stop_gradient((contacts, after, velocity, slow))
+        operands = lax.stop_gradient((contacts, after, end, velocity, slow))
         kick, shift = where_needed(left > 0, settle, unchanged, *operands)
         position, velocity = position + shift, velocity + kick
-    position = jnp.where(lost[:, None], jnp.nan, position)  # a surface that cannot say where it is: announced
+    position = where(lost[:, None], jnp.nan, position)  # a surface that cannot say where it is: announced
     return position, velocity, unresolved + left + undecided + contacts.left_out
 
 
-def settle(contacts: Contacts, path: Path, velocity: Array, slow: Array) -> tuple[Array, Array]:
+def at_end(contacts: Contacts, path: Path) -> Look:
+    """What there is to know of the contacts where the step ends."""
+    return contacts.look(path, jnp.ones(contacts.count, path.s.dtype))
+
+
+def settle(contacts: Contacts, path: Path, end: Look | None, velocity: Array, slow: Array) -> tuple[Array, Array]:
     """What brings to rest together all that touches at the end of a step which had more impacts than are followed.
 
     Changes of velocity and position, (particle, dim). They are not differentiated: the impacts are counted.
     """
     contacts.axis = None  # other devices may have nothing to settle
-    end = contacts.look(path, jnp.ones_like(contacts.both(jnp.add, path.s)))
+    end = at_end(contacts, path) if end is None else end
     small = contacts.roundoff(path.x)
-    touches = (end.gap <= small + contacts.open(slow)) & contacts.possible()
+    touches = (end.gap <= small + contacts.open(slow)) & contacts.possible
     speed = contacts.relative(velocity) + end.recession[:, None] * end.normal + contacts.landing(end.gap, end.normal)
     gap = end.gap / contacts.dt
     problem = Problem.of(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
@@ -141,15 +156,14 @@ def hold(
     else:
         speed = contacts.relative(load) + surface
         rest = at_rest(problem, small, speed)
-    radius = contacts.both(jnp.add, contacts.radius)
-    unclear = stays & (radius > 0) & (small > 0.05 * radius)  # far from the origin nobody can say whether they touch
-    unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | unclear).astype(jnp.int32)
-    touched = _touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1)
+    far = (contacts.reach > 0) & (small > 0.05 * contacts.reach)  # from the origin: nobody can say whether they touch
+    unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | (stays & far)).astype(jnp.int32)
+    touched = decided(_touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1))
     contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
     ground = contacts.of_colliders(jnp.sum(rest.push * normal, axis=-1, keepdims=True) * normal)
     path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.kick, ground)
-    lost = _touched(contacts, jnp.isnan(gap) & (jnp.arange(contacts.count) < contacts.walls)) & contacts.alive
+    lost = decided(_touches_a_collider(contacts, jnp.isnan(gap)) & contacts.alive)
     return path, v + dv + rest.kick, touched, unresolved, lost
 
 
@@ -160,15 +174,18 @@ def at_start(contacts: Contacts, path: Path, slow: Array) -> tuple[Look, Array, 
     small = contacts.roundoff(path.x)
     slowly = -start.slope <= impulsive_limit(contacts, start.normal, path) + slow
     touches = start.gap <= small + contacts.open(slow)
-    return start, small, lax.stop_gradient(touches & slowly & contacts.possible())
+    return start, small, decided(touches & slowly & contacts.possible)
 
 
 def is_deep(contacts: Contacts, gap: Array, small: Array) -> Array:
     """Whether an overlap, (contact,), is more than rounding."""
-    return gap < -2 * small - 1e-6 * contacts.both(jnp.add, contacts.radius)
+    return gap < -2 * small - 1e-6 * contacts.reach
 
 
 def _touched(contacts: Contacts, on: Array) -> Array:
-    wall = jnp.any(on[: contacts.walls].reshape(-1, contacts.particles), axis=0)
-    pairs = on[contacts.walls :]
-    return wall.at[contacts.i].max(pairs).at[contacts.j].max(pairs) if len(contacts.i) else wall
+    wall, pairs = _touches_a_collider(contacts, on), on[contacts.walls :]
+    return wall.at[contacts.i].max(pairs, **THERE).at[contacts.j].max(pairs, **THERE) if len(contacts.i) else wall
+
+
+def _touches_a_collider(contacts: Contacts, on: Array) -> Array:
+    return jnp.any(on[: contacts.walls].reshape(-1, contacts.particles), axis=0)
