@@ -27,6 +27,8 @@ from jeuler.particles.fields import AFTER, BEFORE
 from jeuler.particles.state import FieldForm
 from jeuler.samplers.base import draw_named
 
+ROUNDINGS = 8  # units in the last place of the coordinates and of the way of a step, within which it is at a surface
+
 
 @component(static=("births", "inherits", "generations", "max_births"))
 class SubEmitter:
@@ -150,8 +152,12 @@ class SubEmitter:
         """Who came to the surface in the step: within the margin at its end, or turned back on the way.
 
         A particle that turned back at the surface was (distance - margin) / speed away in time, before and after: a
-        step in all.
+        step in all. What rounding can make of a distance is none: else it would decide whether one that stays counts.
         """
+
+        def rounding(of, velocity):
+            sizes = jnp.abs(of.position) + jnp.abs(velocity * dt.astype(velocity.dtype))
+            return ROUNDINGS * jnp.finfo(sizes.dtype).eps * jnp.max(lax.stop_gradient(sizes), axis=-1)
 
         def distance_and_its_rate(time, of):
             def rate(point, velocity):
@@ -163,9 +169,11 @@ class SubEmitter:
         t = jnp.asarray(t, state.position.dtype)
         before, falling = distance_and_its_rate(t - dt.astype(t.dtype), previous)
         after, rising = distance_and_its_rate(t, state)
-        came = (falling < -self.slowest) & (before > 0)
+        came = (falling < -self.slowest) & (before > rounding(previous, previous.velocity))
         in_step = before * rising - after * falling <= -1.5 * dt * falling * rising
-        return previous.alive & state.alive & came & ((after <= 0) | ((rising > 0) & in_step))
+        fastest = jnp.maximum(jnp.abs(previous.velocity), jnp.abs(state.velocity))
+        there = after <= rounding(state, fastest)
+        return previous.alive & state.alive & came & (there | ((rising > 0) & in_step))
 
     def check(self, particles: int, dim: int) -> None:
         for name in ("inherit", "margin", "slowest"):
