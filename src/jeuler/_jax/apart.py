@@ -22,7 +22,16 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jeuler._jax.batch_last import reached
 from jeuler._jax.jaxpr import Jaxpr, evaluate, holding_programs
 from jeuler._jax.members import _batched, _chosen, _merged, _others, _tangent, _transposed
-from jeuler._jax.placed import as_varying, bare, explicit_mesh, is_placed, manual_axes, type_of, varying_axes
+from jeuler._jax.placed import (
+    as_varying,
+    bare,
+    explicit_mesh,
+    is_placed,
+    manual_axes,
+    told_of_axes,
+    type_of,
+    varying_axes,
+)
 
 PyTree = Any
 
@@ -110,7 +119,7 @@ def _types(*operands, jaxpr):
         plain = bare(result)
         if axes:
             like = next(x for x in operands if varying_axes(x) == axes)
-            return plain.update(sharding=_nowhere(like.sharding.mesh, plain), manual_axis_type=like.manual_axis_type)
+            return plain.update(sharding=_nowhere(like.sharding.mesh, plain), **told_of_axes(like))
         return plain if mesh is None else plain.update(sharding=_nowhere(mesh, plain))
 
     return list(map(type_, jaxpr.out_avals))

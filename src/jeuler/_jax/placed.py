@@ -30,8 +30,13 @@ def bare(x: Any) -> Any:
 
 def varying_axes(x: Any) -> frozenset[str]:
     """The axes of the mesh over which x, an array or its type, differs from device to device in ``jax.shard_map``."""
-    kind = getattr(type_of(x), "manual_axis_type", None)  # since JAX 0.10; before, the type has the set itself
-    return frozenset(getattr(type_of(x), "vma", ()) if kind is None else kind.varying)
+    told = next(iter(told_of_axes(x).values()), None)
+    return frozenset(getattr(told, "varying", told) or ())
+
+
+def told_of_axes(x: Any) -> dict[str, Any]:
+    """What the type of x tells of these axes, by its name there: since JAX 0.10 a record, before the set itself."""
+    return {name: getattr(type_of(x), name) for name in ("manual_axis_type", "vma") if hasattr(type_of(x), name)}
 
 
 def explicit_mesh(x: Any) -> Any:
@@ -72,7 +77,11 @@ def typed(rule: Callable[..., Any], types: Callable[..., Any]) -> Callable[..., 
 def as_varying(x: Any, axes: frozenset[str]) -> Any:
     """x, varying over these axes too, as far as its type goes."""
     more = tuple(sorted(axes - varying_axes(x)))
-    return lax.pcast(x, more, to="varying") if more else x
+    if not more:
+        return x
+    if hasattr(lax, "pcast"):
+        return lax.pcast(x, more, to="varying")
+    return lax.pvary(x, more)  # type: ignore[attr-defined]  # what JAX 0.8 has
 
 
 def as_carried(body: Callable[[PyTree], PyTree], carry: PyTree) -> PyTree:
