@@ -27,7 +27,8 @@ STEPS = {
 APART, TOGETHER = tuple(STEPS)[:6], tuple(STEPS)[6:]  # those that solve with contact have it in their program
 FIRST_ORDER = ("euler", "symplectic", "implicit", "linearly implicit")
 SPEEDS = (-1.0, -0.5, 0.0, 0.0, 0.5, 1.0)
-QUICK = {"xla_cpu_use_fusion_emitters": False}  # compiled in half the time; and where few values are run, also:
+# Compiled in half the time, by an option that versions which are not known might not have; and where few values are run:
+QUICK = {"xla_cpu_use_fusion_emitters": False} if jax.__version__.startswith("0.10.") else {}
 UNOPTIMISED = QUICK | {"xla_backend_optimization_level": 0}
 SHAPES = {  # balls, whether they collide, what else is there, kinds of scene
     "two balls, floor": (2, False, "plane", ("grid", "floor", "slope")),
