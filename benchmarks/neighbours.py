@@ -102,7 +102,7 @@ def milliseconds(run, *args, rounds=3):
 
 
 def agents(number=5000, steps=200):
-    near = jeuler.Neighbours(1.0, 0.5, capacity=32)
+    near = jeuler.Neighbours(1.0, 0.4, capacity=28)
     scene = jeuler.Scene((jeuler.Flocking(near, 2.0, 1.0, 0.5), jeuler.SoftRepulsion(near, 0.5, 50.0)), (near,))
     random = np.random.default_rng(1)
     side = np.sqrt(number) * 0.7
