@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jeuler._core.choice import where
-from jeuler._core.vectors import direction, length, unit
+from jeuler._core.vectors import direction, length, total, unit
 from jeuler.contact.colliders import Plane
 from jeuler.contact.paths import Path
 from jeuler.graphs.cells import rows_of_neighbours
@@ -232,7 +232,7 @@ class Contacts:
     def _of_walls(self, change: Array) -> Array:
         """The sums (particle, ...) of what contacts with colliders add."""
         walls = [self._of_wall(k, change) for k in range(len(self.colliders))]
-        return sum(walls[1:], walls[0]) if walls else jnp.zeros((self.particles, *change.shape[1:]), change.dtype)
+        return total(walls) if walls else jnp.zeros((self.particles, *change.shape[1:]), change.dtype)
 
     def of_colliders(self, change: Array) -> Array:
         """What each collider adds to each particle, (collider, particle, dim); none where there are no others."""
