@@ -19,7 +19,7 @@ HASTE = "jax_disable_most_optimizations"
 HASTY = jax.config.read(HASTE)
 # XLA's older way to write loops takes half the time again, one piece of code less than many. Flags of your own stay;
 # a version that is not known might stop at a flag it does not have.
-if jax.__version__.startswith("0.10."):
+if jax.__version__.startswith(("0.8.", "0.10.")):
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1")
 NAMED_SKIPS = ROOT / "tests" / "skips.txt"
 FAST = (
