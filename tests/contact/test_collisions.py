@@ -241,6 +241,49 @@ def test_second_derivative_through_a_bounce_off_a_sphere():
     np.testing.assert_allclose(jax.jit(jax.hessian(end))(0.05), (slope_above - slope_below) / (2 * h), rtol=1e-6)
 
 
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("step", [jeuler.symplectic_euler_step, jeuler.linearly_implicit_euler_step])
+def test_pairs_without_a_third_are_solved_alone_as_among_others(step, restitution):
+    """Two pairs of other masses that springs draw together, one with a pinned ball; and beside them a wall far away,
+    with which each ball may have several contacts at once."""
+    position = jnp.array([[0.0, 0.0], [0.26, 0.05], [2.0, 0.0], [2.3, 0.1]])
+    velocity = jnp.array([[0.5, 0.0], [-0.2, 0.1], [0.0, 0.0], [-0.6, 0.0]])
+    mass = jnp.array([1.0, 0.5, jnp.inf, 2.0])
+    springs = jeuler.Springs([[0, 1], [2, 3]], 30.0, 0.5, jnp.array([0.15, 0.15]))
+    away = Plane([-50.0, 0.0], [1.0, 0.0])
+
+    def run(position, velocity, friction, colliders):
+        contact = Collisions(colliders, [(0, 1), (2, 3)], radius=0.1, restitution=restitution, friction=friction)
+        scene = jeuler.Scene((springs,), (contact,))
+        state = jeuler.ParticleState(position, velocity, mass)
+        return jeuler.simulate(scene, state, dt=0.01, num_steps=40, step=step)
+
+    def sums(colliders):
+        def weighted(*numbers):
+            end = run(*numbers, colliders)
+            weights = jnp.arange(1.0, 9.0).reshape(4, 2)
+            return jnp.sum(weights * end.y.position[-1] + end.y.velocity[-1] / weights), end.unresolved_contacts
+
+        gradient = jax.jit(jax.value_and_grad(weighted, argnums=(0, 1, 2), has_aux=True))
+        return gradient(position, velocity, 0.3)
+
+    (alone, count), gradient = sums(())
+    (among, _), of_among = sums((away,))
+    assert count == 0
+    np.testing.assert_allclose(alone, among, rtol=1e-9)
+    for one, other in zip(gradient, of_among, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize(("speed", "counted"), [(0.9, 0), (1.0, 1), (1.1, 0)])
+def test_an_impact_with_friction_exactly_at_its_limit_is_counted(speed, counted):
+    """|v_t| = friction (1 + restitution) |v_n| = 1: whether it sticks, rounding decides; it has no other contact."""
+    contact = Collisions((FLOOR,), radius=0.1, restitution=1.0, friction=0.5)
+    state = ball([0.0, 0.6], [speed, -1.0])
+    run = jeuler.simulate(jeuler.Scene(effects=(contact,)), state, dt=0.25, num_steps=4)
+    assert run.unresolved_contacts == counted
+
+
 @pytest.mark.parametrize("capacity", [None, 2])
 def test_near_pairs_are_those_that_can_meet_and_others_are_counted(capacity):
     """On a grid with equal, touching and coinciding balls; the dead and pairs that cannot move are no pairs."""

@@ -90,6 +90,27 @@ def test_stack_of_balls_and_a_spring_beside_an_implicit_step():
     assert int(run.unresolved_contacts) == 0
 
 
+def test_parts_of_an_extrapolated_step_have_the_same_contacts():
+    """One ball leaves from under another, so that the gap opens within the step: were it looked at in each part, parts
+    of other lengths would have contact forces of other shares, and what is extrapolated from them energy."""
+    step = jeuler.extrapolated_euler(3, step=jeuler.linearly_implicit_euler_step)
+    slide = Collisions((FLOOR,), [(0, 1)], radius=0.1, restitution=0.5)
+    position = jnp.array([[0.3, 0.1], [0.3, 0.3]])
+
+    @jax.jit
+    @jax.vmap
+    def run(speed):
+        velocity = jnp.zeros((2, 2)).at[0].set(speed)
+        scene = jeuler.Scene((GRAVITY,), (slide,))
+        return jeuler.simulate(scene, jeuler.ParticleState(position, velocity), dt=0.01, num_steps=24, step=step)
+
+    changes = jnp.array([[0.0, 0.0], [1e-6, 0.0], [-1e-6, 0.0], [0.0, 1e-6]])
+    runs = run(jnp.array([0.5, 0.0]) + changes)
+    energy = np.sum(runs.y.velocity**2 / 2 + G * runs.y.position * np.array([0.0, 1.0]), axis=(2, 3))
+    assert np.max(energy - energy[:, :1]) < 1e-3
+    np.testing.assert_allclose(runs.y.position[1:], runs.y.position[:1].repeat(3, 0), atol=1e-5)
+
+
 def test_net_of_many_balls_stands_on_the_floor():
     """More unknowns than are solved for with a matrix: the floor carries the whole net, each vertical layer its part."""
     wide, high = 8, 9

@@ -16,7 +16,7 @@ from jeuler._core.calls import previous_is_optional
 from jeuler._core.component import component, store_as_float
 from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.contact.contacts import Contacts
-from jeuler.contact.within_step import answer, resolve
+from jeuler.contact.within_step import answer, at_start_of_fall, resolve
 
 FEW_PAIRS = 32  # of them, XLA's faster loops do not pay for their compilation
 
@@ -114,11 +114,22 @@ class Collisions:
         count = before if before is None else before + unresolved
         return dataclasses.replace(state, position=position, velocity=velocity, unresolved_contacts=count)
 
-    def answer(self, t: Any, dt: Any, state: Any, acceleration: Array) -> Callable[[Array], Array]:
-        """What contacts at rest add to the velocities at the end of a step from this state, given these velocities."""
-        x = state.position
-        contacts = Contacts(self, jnp.asarray(t), jnp.asarray(dt), x, state.mass, state.alive)
-        return answer(contacts, x, state.velocity, acceleration)
+    def answer(
+        self, t: Any, dt: Any, state: Any, acceleration: Array, whole: tuple[Any, ...] | None = None
+    ) -> Callable[[Array], Array]:
+        """What contacts at rest add to the velocities at the end of a step from this state, given these velocities.
+
+        A part of a step has these arguments of the ``whole``: what touches at its start stays in touch in all parts, so
+        that they differ by their length alone.
+        """
+
+        def at(t, dt, state, acceleration):
+            contacts = Contacts(self, jnp.asarray(t), jnp.asarray(dt), state.position, state.mass, state.alive)
+            return contacts, state.position, state.velocity, acceleration
+
+        here = at(t, dt, state, acceleration)
+        stays = at_start_of_fall(*at(*whole))[2] if whole is not None and here[0].follows_all else None
+        return answer(*here, stays)
 
     @property
     def writes(self) -> tuple[str, ...]:

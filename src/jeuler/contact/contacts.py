@@ -51,6 +51,7 @@ class Contacts:
     particles: int
     dim: int
     row: int  # the most balls within reach of one, where `near` is to find the pairs; 0 where they are named
+    alone: bool  # whether each particle has one contact at most
     t0: Array
     dt: Array
     restitution: Array
@@ -76,8 +77,11 @@ class Contacts:
         self.inverse_mass = jnp.broadcast_to(1 / mass.astype(dtype), self.particles)
         self.alive = jnp.ones(self.particles, bool) if alive is None else alive
         self.row = (collisions.capacity or ROW) if collisions.pairs == "near" else 0
+        self.alone = len(self.colliders) == 1 and not collisions.pairs
         if not self.row:
-            i, j = (jnp.asarray(k) for k in np.array(collisions.pairs, np.int32).reshape(-1, 2).T)
+            named = np.array(collisions.pairs, np.int32).reshape(-1, 2)
+            self.alone |= not self.colliders and len(np.unique(named)) == named.size
+            i, j = (jnp.asarray(k) for k in named.T)
             self._follow(i, j, jnp.ones(len(i), bool))
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
@@ -85,14 +89,14 @@ class Contacts:
         self.axis: str | None = getattr(collisions, "axis", None)  # of the devices that share the particles
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        fixed = ("particles", "dim", "row", "axis")
+        fixed = ("particles", "dim", "row", "alone", "axis")
         names = tuple(name for name in vars(self) if name not in fixed)
         return tuple(getattr(self, name) for name in names), (names, *(getattr(self, name) for name in fixed))
 
     @classmethod
     def tree_unflatten(cls, kept: tuple[Any, ...], values: tuple[Any, ...]) -> Contacts:
         self = object.__new__(cls)
-        names, self.particles, self.dim, self.row, self.axis = kept
+        names, self.particles, self.dim, self.row, self.alone, self.axis = kept
         vars(self).update(zip(names, values, strict=True))
         return self
 
@@ -116,14 +120,19 @@ class Contacts:
         return self.walls + len(self.i)
 
     @property
-    def alone(self) -> bool:
-        """Whether each particle has one contact at most."""
-        return len(self.colliders) == 1 and not len(self.i)
-
-    @property
     def many(self) -> bool:
         """Whether there are so many pairs that what rests together is solved for by iterations alone."""
-        return len(self.i) * (self.dim + 1) > DENSE_UP_TO
+        return not self.alone and len(self.i) * (self.dim + 1) > DENSE_UP_TO
+
+    @property
+    def capacity(self) -> int:
+        """How many pairs are followed in a step, where they are many."""
+        return CANDIDATES * self.dim * self.particles
+
+    @property
+    def follows_all(self) -> bool:
+        """Whether each step has all contacts in its list, in their order."""
+        return not self.row and len(self.i) <= 2 * self.capacity
 
     def largest(self, x: Array) -> Array:
         """The largest of x, at least 0, on all devices that share the particles. Not in a loop, where these part."""
@@ -154,11 +163,11 @@ class Contacts:
         Balls that are further apart than four times the longest way of any of them do not meet. Where too many are
         nearer, the nearest are kept.
         """
-        capacity = CANDIDATES * self.dim * self.particles
         if self.row:
-            return self._find(path, capacity)
-        if len(self.i) <= 2 * capacity:
+            return self._find(path)
+        if self.follows_all:
             return
+        capacity = self.capacity
         way = jax.lax.stop_gradient(length(path.way) + length(path.bend))
         x = jax.lax.stop_gradient(path.x)
         apart = length(x[self.i] - x[self.j]) - self.radius[self.i] - self.radius[self.j]
@@ -172,9 +181,9 @@ class Contacts:
         self.left_out = (numbers[0] - number).astype(jnp.int32)
         self._follow(rows(self.i, kept), rows(self.j, kept), jnp.arange(capacity) < number)
 
-    def _find(self, path: Path, capacity: int) -> None:
+    def _find(self, path: Path) -> None:
         """The pairs of all balls that can meet in this step, by a list of cells; those beyond the rows are counted."""
-        n, capacity = self.particles, min(capacity, self.particles * (self.particles - 1) // 2)
+        n, capacity = self.particles, min(self.capacity, self.particles * (self.particles - 1) // 2)
         x, way, radius = lax.stop_gradient((path.x, length(path.way) + length(path.bend), self.radius))
         way = 4 * jnp.max(where(self.alive & jnp.isfinite(way), way, 0), initial=0)
         coarse = 1e-6 * jnp.max(where(jnp.isfinite(x), jnp.abs(x), 0), initial=1e-30)  # cells are counted by int32
@@ -261,7 +270,7 @@ class Contacts:
 
     def chosen(self, of: Array) -> tuple[Contacts | Chosen, Array]:
         """These contacts, (contact,), alone in a list where they are few among many, and their numbers in it."""
-        capacity = CANDIDATES * self.dim * self.particles
+        capacity = self.capacity
         numbers = jnp.arange(self.count)
         if 2 * self.count <= 3 * capacity or self.count * (self.dim + 1) <= 4 * DENSE_UP_TO:
             return self, numbers

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jeuler._core.choice import where
-from jeuler._core.vectors import direction, length
+from jeuler._core.vectors import direction, length, total
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import THERE, Contacts, Look, rows
@@ -136,7 +136,7 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
     is pushed against balls that hold it, and no collider, stays, and the other partner takes all.
     """
     if contacts.alone:
-        return contacts.gather(change, change)
+        return contacts.move(change)
     _, bend, support = path.sizes()
     least = 1e-6 * (bend + support)  # of a push; what is less is left by iterations
     size, upward = direction(path.ground)
@@ -224,10 +224,10 @@ def schedule(
 
 def undecided(contacts: Contacts, path: Path, after: Path, events: Events, found: Found) -> Array:
     """How many impacts of a round have an outcome that rounding decides, (), int32."""
-    if contacts.alone:
-        return jnp.int32(0)
-    orders, leaves = of_an_order(contacts, path, after, events, found), may_leave(path, after, events)
-    return (jnp.sum(orders) + jnp.sum(leaves) + jnp.sum(may_stick(contacts, events, found))).astype(jnp.int32)
+    which = [may_stick(contacts, events, found)]
+    if not contacts.alone:
+        which += [of_an_order(contacts, path, after, events, found), may_leave(path, after, events)]
+    return total(jnp.sum(of_each) for of_each in which).astype(jnp.int32)
 
 
 def of_an_order(contacts: Contacts, path: Path, after: Path, events: Events, found: Found) -> Array:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,7 @@ class Rest(NamedTuple):
 
     kick: Array  # (particle, dim), what they add to the velocity, m/s
     push: Array  # (contact, dim), what each would add to the relative velocity of its partners if it were alone, m/s
+    support: Array  # (particle, dim), the kick, and what of the velocities are forces that hold already, m/s
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -60,13 +61,12 @@ class Problem(NamedTuple):
     theta: Array  # (particle, 1), share of a kick that moves the particle in this step
     active: Array  # (contact,), who touches
     clear: Array  # (contact,), gap at the start, over dt, m/s: what does not touch is not to be pushed into either
+    forced: Array  # (), whether a force acts on any particle: without one, all that pushes is a rounding
     fastest: Array  # (), the largest speed of all these velocities, m/s
 
     @classmethod
-    def of(cls, contacts: Contacts | Chosen, normal: Array, velocity: Array, *others: Array) -> Problem:
-        gap, theta, active, clear = others
-        fastest = contacts.largest(length(velocity))
-        return cls(contacts, normal, velocity, gap, theta, active, clear, fastest)
+    def of(cls, contacts: Contacts | Chosen, normal: Array, velocity: Array, *others: Any) -> Problem:
+        return cls(contacts, normal, velocity, *others, contacts.largest(length(velocity)))
 
     def push(self, w: Array) -> Array:
         """The normal component of w, (contact,), m/s."""
@@ -100,7 +100,7 @@ class Problem(NamedTuple):
 
     def weak(self) -> Array:
         """A push, m/s, that may be a rounding, or what the iterations leave."""
-        return 100 * self.relative_tolerance() * self.fastest
+        return where(self.forced, 100 * self.relative_tolerance() * self.fastest, jnp.inf)
 
     def relative_tolerance(self) -> float:
         """How near to the fixed point the iterations come, in parts of the largest velocity of the problem."""
@@ -122,7 +122,14 @@ class Problem(NamedTuple):
             return y.at[kept].get(mode="fill", fill_value=0)
 
         own = Problem.of(
-            contacts, of(self.normal), of(self.velocity), of(self.gap), self.theta, of(self.active), of(self.clear)
+            contacts,
+            of(self.normal),
+            of(self.velocity),
+            of(self.gap),
+            self.theta,
+            of(self.active),
+            of(self.clear),
+            self.forced,
         )
         return own, kept
 
@@ -181,18 +188,20 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     small = small / contacts.dt
 
     stays = unclear = jnp.zeros_like(active)
+    carried = None
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
         stays = (jnp.abs(problem.gap) <= small + problem.weak()) & (loaded.push(impulses) > loaded.weak())
         unclear = loaded.at_the_limit(impulses)
+        carried = where(stays[:, None], impulses, 0)
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
 
-    if contacts.alone:  # each particle for itself: exact at once
+    if contacts.alone:  # each contact for itself: exact at once
         w = problem.project(-problem.velocity)
-        gap = problem.gap + problem.push(problem.theta * w)
+        gap = problem.gap + problem.push(contacts.relative(problem.theta * contacts.move(w)))
         on = pressed(w, problem.velocity + w) | lax.stop_gradient(active & (gap < -small))
         u = jnp.concatenate([w, where(on, -gap, 0)[:, None]], axis=1)
         unresolved = jnp.sum(unclear | lax.stop_gradient(problem.at_the_limit(w))).astype(jnp.int32)
@@ -202,7 +211,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         w, q = start[:, :-1], start[:, -1]
         velocity, gap, _ = problem.at_end(w, q)
         presses = pressed(w, velocity)
-        on = lax.stop_gradient(presses | ((q > 0) & ((gap < -small) | ~active)))
+        on = lax.stop_gradient(presses | ((q > 0) & ((gap < -small) | (q > small) | ~active)))
         overlap = where(presses, 0, small)
         u = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
         off = lax.stop_gradient(problem.residual(u, rate, on, overlap))  # Newton's step may have ended it
@@ -213,7 +222,9 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)
     left = where(active, contacts.dt * left, 0)
-    return Rest(contacts.move(w), w, contacts.dt * shift, on, left, unresolved)
+    push = w if carried is None else w + carried
+    kick, support = contacts.move(w), contacts.move(push)
+    return Rest(kick, push, support, contacts.dt * shift, on, left, unresolved)
 
 
 def loads(problem: Problem, small: Array) -> Array:

@@ -64,6 +64,8 @@ def _resolve(
     slow = _slow(contacts, dv)
 
     path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, load)
+    if load is not None:  # of a step that holds what rests, the forces cancel
+        slow = slow + _slow(contacts, path.support / contacts.dt)
     contacts.lift_off(path)
     impacts = schedule(contacts, *lax.stop_gradient((path, slow, theta)), rounds)
     events, after, left, undecided = checkpoint_name(impacts, IMPACTS)
@@ -100,7 +102,7 @@ def settle(contacts: Contacts, path: Path, end: Look | None, velocity: Array, sl
     touches = (end.gap <= small + contacts.open(slow)) & contacts.possible
     speed = contacts.relative(velocity) + end.recession[:, None] * end.normal + contacts.landing(end.gap, end.normal)
     gap = end.gap / contacts.dt
-    problem = Problem.of(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap)
+    problem = Problem.of(contacts, end.normal, speed, gap, jnp.zeros_like(path.s)[:, None], touches, gap, True)
     return together(problem, small)
 
 
@@ -109,24 +111,33 @@ def _slow(contacts: Contacts, dv: Array) -> Array:
     return 1e-3 * contacts.dt * contacts.both(jnp.add, length(lax.stop_gradient(dv)))
 
 
-def answer(contacts: Contacts, x: Array, v: Array, acceleration: Array) -> Callable[[Array], Array]:
+def answer(
+    contacts: Contacts, x: Array, v: Array, acceleration: Array, stays: Array | None = None
+) -> Callable[[Array], Array]:
     """What contacts at rest add to velocities (particle, dim) at the end of a step from (x, v), as a function of these.
 
     For steps that solve for their end: u = v + dt a(x + dt u, u) + answer(v + dt a(x + dt u, u)). The acceleration
-    without contact, at the start, says how fast an approach the forces of a step make.
+    without contact, at the start, says how fast an approach the forces of a step make. Who ``stays``, (contact,), may
+    be known.
     """
-    dv = contacts.dt * acceleration
-    path = free_path(x, contacts.dt * (v + dv / 2), dv, contacts.dt)
-    contacts.near(path)
-    (gap, _, normal, recession, _), small, stays = at_start(contacts, path, _slow(contacts, dv))
-    standing = jnp.zeros((len(x), 1), x.dtype)
+    (gap, _, normal, recession, _), small, touching = at_start_of_fall(contacts, x, v, acceleration)
+    stays = touching if stays is None else stays
+    standing, forced = jnp.zeros((len(x), 1), x.dtype), contacts.largest(length(acceleration)) > 0
 
     def kick(u):
         velocity = contacts.relative(u) + recession[:, None] * normal + contacts.landing(gap, normal)
-        problem = Problem.of(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0)
+        problem = Problem.of(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0, forced)
         return at_rest(problem, small).kick
 
     return kick
+
+
+def at_start_of_fall(contacts: Contacts, x: Array, v: Array, acceleration: Array) -> tuple[Look, Array, Array]:
+    """What `at_start` says of a step from (x, v) with this acceleration."""
+    dv = contacts.dt * acceleration
+    path = free_path(x, contacts.dt * (v + dv / 2), dv, contacts.dt)
+    contacts.near(path)
+    return at_start(contacts, path, _slow(contacts, dv))
 
 
 def _end(path: Path) -> tuple[Array, Array]:
@@ -150,7 +161,8 @@ def hold(
     surface = recession[:, None] * normal + contacts.landing(gap, normal)
     end_speed = contacts.relative(v + dv) + surface
     gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
-    problem = Problem.of(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt)
+    forced = contacts.largest(length(dv if load is None else load - v)) > 0
+    problem = Problem.of(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt, forced)
     if load is None:
         rest = at_rest(problem, small)
     else:
@@ -162,7 +174,7 @@ def hold(
     contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
     ground = contacts.of_colliders(jnp.sum(rest.push * normal, axis=-1, keepdims=True) * normal)
-    path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.kick, ground)
+    path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.support, ground)
     lost = decided(_touches_a_collider(contacts, jnp.isnan(gap)) & contacts.alive)
     return path, v + dv + rest.kick, touched, unresolved, lost
 

@@ -74,23 +74,26 @@ class SceneStep:
         """What makes contact at rest part of the equation of a step that solves for its end; None where there is none.
 
         ``in_step(f, t, y, dt, attributes)`` is f with it: v + dt f is the velocity after the forces, contact included.
+        A part of a step has the ``whole``, (t, y, dt), which says what touches.
         """
         in_the_solve = [effect for effect in self.scene.effects if needs(effect, "the solve")]
         explicit = getattr(self.step, "explicit", False)
         if not in_the_solve or explicit or not getattr(self.step, "solves_contact", True):
             return None
 
-        def in_step(f, t, y, dt, attributes):
-            x, v = y
-            mass = self.with_prescribed_pinned(t, jnp.broadcast_to(attributes.mass, (len(x),)), x.dtype)
-            state = ParticleState(x, v, mass, alive=attributes.alive)
-            start = f(t, y, attributes)[1]
-            answers = [effect.answer(t, dt, state, start) for effect in in_the_solve]
+        def in_step(f, t, y, dt, attributes, whole=None):
+            def at(t, y, dt):
+                x, v = y
+                mass = self.with_prescribed_pinned(t, jnp.broadcast_to(attributes.mass, (len(x),)), x.dtype)
+                return t, dt, ParticleState(x, v, mass, alive=attributes.alive), f(t, y, attributes)[1]
+
+            (_, velocity), whole = y, None if whole is None else at(*whole)
+            answers = [effect.answer(*at(t, y, dt), whole) for effect in in_the_solve]
 
             def with_contact(t, y, attributes):
                 slope, acceleration = f(t, y, attributes)
                 for answer in answers:
-                    acceleration = acceleration + answer(v + dt * acceleration) / dt
+                    acceleration = acceleration + answer(velocity + dt * acceleration) / dt
                 return slope, acceleration
 
             return with_contact
@@ -216,12 +219,17 @@ class FieldInStep:
 
     field: VectorField
     changed: Callable[..., VectorField]
+    whole: Any = None
 
     def __call__(self, t: Any, y: Any, args: Any) -> Any:
         return self.field(t, y, args)
 
     def in_step(self, t: Any, y: Any, dt: Any, args: Any) -> VectorField:
-        return self.changed(self.field, t, y, dt, args)
+        return self.changed(self.field, t, y, dt, args, self.whole)
+
+    def within(self, t: Any, y: Any, dt: Any) -> FieldInStep:
+        """The field in parts of the step from (t, y)."""
+        return dataclasses.replace(self, whole=(t, y, dt))
 
 
 def on_arrays(step: Step, changed: Callable[..., VectorField] | None = None) -> Step:
