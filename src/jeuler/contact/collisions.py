@@ -129,7 +129,7 @@ class Collisions:
 
         here = at(t, dt, state, acceleration)
         stays = at_start_of_fall(*at(*whole))[2] if whole is not None and here[0].follows_all else None
-        return answer(*here, stays)
+        return answer(*here, stays=stays)
 
     @property
     def writes(self) -> tuple[str, ...]:

@@ -66,7 +66,8 @@ class Problem(NamedTuple):
 
     @classmethod
     def of(cls, contacts: Contacts | Chosen, normal: Array, velocity: Array, *others: Any) -> Problem:
-        return cls(contacts, normal, velocity, *others, contacts.largest(length(velocity)))
+        gap, theta, active, clear, forced = others
+        return cls(contacts, normal, velocity, gap, theta, active, clear, forced, contacts.largest(length(velocity)))
 
     def push(self, w: Array) -> Array:
         """The normal component of w, (contact,), m/s."""
