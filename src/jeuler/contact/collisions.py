@@ -123,13 +123,14 @@ class Collisions:
         that they differ by their length alone.
         """
 
-        def at(t, dt, state, acceleration):
-            contacts = Contacts(self, jnp.asarray(t), jnp.asarray(dt), state.position, state.mass, state.alive)
-            return contacts, state.position, state.velocity, acceleration
+        def contacts(t: Any, dt: Any, state: Any) -> Contacts:
+            return Contacts(self, jnp.asarray(t), jnp.asarray(dt), state.position, state.mass, state.alive)
 
-        here = at(t, dt, state, acceleration)
-        stays = at_start_of_fall(*at(*whole))[2] if whole is not None and here[0].follows_all else None
-        return answer(*here, stays=stays)
+        here, stays = contacts(t, dt, state), None
+        if whole is not None and here.follows_all:
+            *began, first = whole
+            _, _, stays = at_start_of_fall(contacts(*began), began[2].position, began[2].velocity, first)
+        return answer(here, state.position, state.velocity, acceleration, stays)
 
     @property
     def writes(self) -> tuple[str, ...]:
