@@ -71,11 +71,17 @@ def in_dtypes_of(y: PyTree, x: PyTree) -> PyTree:
 
 
 def all_finite(y: PyTree) -> Array:
-    """Whether every number in y is finite, a boolean scalar."""
-    finite = jnp.asarray(True)
+    """Whether every number in y is finite, a boolean scalar.
+
+    By one sum of floats for all leaves of a shape: an "and" of booleans takes XLA on CPU more kernels, and up to
+    six times as long to compile.
+    """
+    by_shape: dict[tuple[int, ...], Any] = {}
     for leaf in jax.tree.leaves(y):
-        finite &= jnp.all(jnp.isfinite(leaf))
-    return finite
+        finite = jnp.isfinite(leaf)
+        by_shape[finite.shape] = finite & by_shape.get(finite.shape, True)
+    counts = [jnp.sum(jnp.where(finite, jnp.float32(0), 1)) for finite in by_shape.values()]
+    return sum(counts, jnp.float32(0)) == 0
 
 
 def largest(y: PyTree) -> Array:
