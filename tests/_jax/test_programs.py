@@ -38,6 +38,16 @@ def power(k):
     return (1 + k / 4) ** 4
 
 
+def test_a_scene_and_a_state_of_numbers_lists_and_arrays_of_numpy_compile_nothing():
+    def built(rows):
+        at = np.arange(2.0 * rows).reshape(rows, 2)  # of a shape that nothing before had
+        state = jeuler.ParticleState(at, 0 * at, mass=2.5)
+        scene = jeuler.Scene((jeuler.Gravity([0.0] * rows), jeuler.Springs([[0, 1]], ks=1, kd=0.5, rest_length=at[0])))
+        return state.position, scene
+
+    assert compilations(lambda rows: built(rows)[0], (61,), (67,)) == [0, 0]
+
+
 # What must compile once
 
 

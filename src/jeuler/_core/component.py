@@ -104,8 +104,13 @@ def as_float(x: ArrayLike | None) -> Array | None:
 
 
 def from_numpy(x: np.ndarray) -> Array:
-    """An array of NumPy as one of JAX in its own dtype: without a dtype, JAX compiles a program for each new shape."""
-    return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype))
+    """An array of NumPy as one of JAX in its own dtype, or what JAX makes of it.
+
+    NumPy converts it: to convert it itself, or where no dtype is named, JAX compiles a program for each new shape.
+    """
+    dtype = jax.dtypes.canonicalize_dtype(x.dtype)
+    with np.errstate(over="ignore"):
+        return jnp.asarray(x.astype(dtype, copy=False), dtype)
 
 
 def store_as_float(component: Any, *names: str) -> None:

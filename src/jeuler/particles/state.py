@@ -211,7 +211,7 @@ def _array(name: str, value: Any) -> Array:
     try:
         if isinstance(value, np.ndarray) and value.dtype.kind in "biufc":
             return from_numpy(value)
-        return jnp.asarray(value)
+        return jax.device_put(value) if type(value) is float else jnp.asarray(value)  # asarray would compile a program
     except (TypeError, ValueError):
         raise ValueError(f"ParticleState.{name} must be an array of numbers, got {checks.shown(value)}") from None
 
