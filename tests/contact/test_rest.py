@@ -172,6 +172,26 @@ def test_ball_that_is_hit_off_the_floor_falls_from_then_on():
     np.testing.assert_allclose(end.y.position[-1, 0], [0.8 * half, 0.1 + 0.6 * half - 4.9 * half**2], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    "step",
+    [
+        jeuler.euler_step,
+        jeuler.rk4_step,
+        jeuler.implicit_euler_step,
+        jeuler.linearly_implicit_euler_step,
+        jeuler.extrapolated_euler(3, step=jeuler.linearly_implicit_euler_step),
+    ],
+    ids=lambda step: step.__name__,
+)
+def test_ball_that_slides_into_a_wall_stays_on_its_floor(step):
+    """What holds it up is the floor's push, whose direction the wall leaves alone; not its friction, which the wall turns."""
+    corner = Collisions((FLOOR, Plane([0.0, 0.0], [1.0, 0.0])), radius=0.1, restitution=1.0, friction=0.3)
+    end = run(corner, [[0.1, 0.1], [0.35, 0.1]], [[-1.0, 0.0], [-1.0, 0.0]], dt=1 / 30, num_steps=12, step=step)
+    np.testing.assert_allclose(end.y.position[:, :, 1], 0.1, atol=1e-12)
+    assert (end.y.position[-1, :, 0] > end.y.position[0, :, 0] - 0.2).all()
+    assert (end.y.velocity[2, 0, 0] > 0) & (np.abs(end.y.velocity[-1, :, 0]) < 0.5).all()
+
+
 def test_a_scene_does_not_depend_on_the_others_of_its_batch():
     """One of two has more impacts in a step than are followed, and is brought to rest; the other is not touched by it."""
     pairs = [(0, 1), (1, 2)]

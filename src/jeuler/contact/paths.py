@@ -34,7 +34,7 @@ class Path(NamedTuple):
     bend: Array  # (particle, dim), m
     jump: Array  # (particle, dim), what impacts added to the velocity, m/s
     hit: Array  # (particle,), whether there was an impact
-    support: Array  # (particle, dim), what of bend are forces of contacts that it stays in, m
+    support: Array  # (particle, dim), what of bend are normal forces of contacts that it stays in, m
     ride: Array  # (particle,), dx/ds along the support while it stays, m a step
     ground: Array  # (collider, particle, dim), how each collider pushes against bend, m; none where it has one contact
 
@@ -52,7 +52,7 @@ class Path(NamedTuple):
 
 
 def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = None, ground: Any = None) -> Path:
-    """The path of a step without impacts; ``kick`` is what of dv contacts give that last through the step, and
+    """The path of a step without impacts; ``kick`` is what of dv are normal forces of contacts that last, and
     ``ground`` what each collider gives to push against, (collider, particle, dim), m/s."""
     zero, bend = jnp.zeros(len(x), x.dtype), dt * dv
     ground = jnp.zeros((0, *x.shape), x.dtype) if ground is None else dt * ground

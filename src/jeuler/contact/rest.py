@@ -43,8 +43,8 @@ class Rest(NamedTuple):
     """What the contacts at rest do in a step."""
 
     kick: Array  # (particle, dim), what they add to the velocity, m/s
-    push: Array  # (contact, dim), what each would add to the relative velocity of its partners if it were alone, m/s
-    support: Array  # (particle, dim), the kick, and what of the velocities are forces that hold already, m/s
+    push: Array  # (contact, dim), what each would add along its normal to its partners' relative velocity if alone, m/s
+    support: Array  # (particle, dim), the normal part of it, with what of the velocities are forces that hold, m/s
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -223,9 +223,8 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)
     left = where(active, contacts.dt * left, 0)
-    push = w if carried is None else w + carried
-    kick, support = contacts.move(w), contacts.move(push)
-    return Rest(kick, push, support, contacts.dt * shift, on, left, unresolved)
+    push = problem.push(w if carried is None else w + carried)[:, None] * problem.normal
+    return Rest(contacts.move(w), push, contacts.move(push), contacts.dt * shift, on, left, unresolved)
 
 
 def loads(problem: Problem, small: Array) -> Array:

@@ -173,7 +173,7 @@ def hold(
     touched = decided(_touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1))
     contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
-    ground = contacts.of_colliders(jnp.sum(rest.push * normal, axis=-1, keepdims=True) * normal)
+    ground = contacts.of_colliders(rest.push)
     path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.support, ground)
     lost = decided(_touches_a_collider(contacts, jnp.isnan(gap)) & contacts.alive)
     return path, v + dv + rest.kick, touched, unresolved, lost
