@@ -111,6 +111,26 @@ def test_parts_of_an_extrapolated_step_have_the_same_contacts():
     np.testing.assert_allclose(runs.y.position[1:], runs.y.position[:1].repeat(3, 0), atol=1e-5)
 
 
+@pytest.mark.parametrize("step", [IMPLICIT, jeuler.linearly_implicit_euler_step], ids=lambda step: step.__name__)
+def test_derivative_of_a_ball_that_a_wall_takes_off_its_floor(step):
+    """What the floor no longer carries then has a derivative, as the solve had that of its force."""
+    corner = Collisions((FLOOR, Plane([0.0, 0.0], [0.6, 0.8])), radius=0.1, restitution=1.0, friction=0.3)
+
+    @jax.jit
+    def end(velocity):
+        state = jeuler.ParticleState(jnp.array([[1 / 30, 0.1]]), velocity[None])
+        return jeuler.simulate(jeuler.Scene((GRAVITY,), (corner,)), state, dt=0.02, num_steps=3, step=step).y.position[
+            -1, 0
+        ]
+
+    velocity = jnp.array([-0.5, 0.0])
+    derivative = jax.jacrev(end)(velocity)
+    for change in (1e-6, -1e-6):
+        moved = [(end(velocity.at[k].add(change)) - end(velocity)) / change for k in range(2)]
+        np.testing.assert_allclose(derivative.T, moved, atol=1e-6)
+    assert end(velocity)[1] > 0.103
+
+
 def test_net_of_many_balls_stands_on_the_floor():
     """More unknowns than are solved for with a matrix: the floor carries the whole net, each vertical layer its part."""
     wide, high = 8, 9

@@ -44,7 +44,8 @@ class Rest(NamedTuple):
 
     kick: Array  # (particle, dim), what they add to the velocity, m/s
     push: Array  # (contact, dim), what each would add along its normal to its partners' relative velocity if alone, m/s
-    support: Array  # (particle, dim), the normal part of it, with what of the velocities are forces that hold, m/s
+    support: Array  # (particle, dim), the normal part of the kick, and what is carried, m/s
+    carried: Array  # (particle, dim), normal forces of contacts that the velocities hold already, m/s; no derivative
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -189,7 +190,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     small = small / contacts.dt
 
     stays = unclear = jnp.zeros_like(active)
-    carried = None
+    carried = jnp.zeros_like(problem.normal)
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
@@ -223,8 +224,9 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     _, _, left = problem.at_end(w, q)
     shift = contacts.move(q[:, None] * problem.normal)
     left = where(active, contacts.dt * left, 0)
-    push = problem.push(w if carried is None else w + carried)[:, None] * problem.normal
-    return Rest(contacts.move(w), push, contacts.move(push), contacts.dt * shift, on, left, unresolved)
+    push, carried = (problem.push(y)[:, None] * problem.normal for y in (w + carried, lax.stop_gradient(carried)))
+    support, carried = contacts.move(push), lax.stop_gradient(contacts.move(carried))
+    return Rest(contacts.move(w), push, support, carried, contacts.dt * shift, on, left, unresolved)
 
 
 def loads(problem: Problem, small: Array) -> Array:

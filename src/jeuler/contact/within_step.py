@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
 from jeuler._core.choice import where
-from jeuler._core.vectors import length
+from jeuler._core.vectors import length, unit
 from jeuler._jax.anywhere import where_needed
 from jeuler._jax.found import found, found_p
 from jeuler.contact.contacts import THERE, Contacts, Look
@@ -50,7 +50,7 @@ def resolve(
     A step that may have solved for its end with the forces of what rests says the acceleration, (particle, dim), at its
     start without them: by it is known what presses.
     """
-    load = None if acceleration is None else lax.stop_gradient(v + contacts.dt * acceleration)
+    load = None if acceleration is None else v + contacts.dt * acceleration
     step = functools.partial(_resolve, rounds=rounds, load=load)
     return jax.checkpoint(step, prevent_cse=False, policy=_kept)(contacts, x, v, x_free, v_free)
 
@@ -166,8 +166,9 @@ def hold(
     if load is None:
         rest = at_rest(problem, small)
     else:
-        speed = contacts.relative(load) + surface
-        rest = at_rest(problem, small, speed)
+        rest = at_rest(problem, small, contacts.relative(load) + surface)
+        upward, already = unit(rest.carried), jnp.sum(unit(rest.carried) * (v + dv - load), axis=-1, keepdims=True)
+        rest = rest._replace(support=rest.support + (already - lax.stop_gradient(already)) * upward)
     far = (contacts.reach > 0) & (small > 0.05 * contacts.reach)  # from the origin: nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | (stays & far)).astype(jnp.int32)
     touched = decided(_touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1))
