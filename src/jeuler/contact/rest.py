@@ -45,7 +45,7 @@ class Rest(NamedTuple):
     kick: Array  # (particle, dim), what they add to the velocity, m/s
     push: Array  # (contact, dim), what each would add along its normal to its partners' relative velocity if alone, m/s
     support: Array  # (particle, dim), the normal part of the kick, and what is carried, m/s
-    carried: Array  # (particle, dim), normal forces of contacts that the velocities hold already, m/s; no derivative
+    carried: Array | None  # (particle, dim), normal forces that the velocities hold already, m/s; no derivative
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -190,13 +190,13 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     small = small / contacts.dt
 
     stays = unclear = jnp.zeros_like(active)
-    carried = jnp.zeros_like(problem.normal)
+    held = None
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
         stays = (jnp.abs(problem.gap) <= small + problem.weak()) & (loaded.push(impulses) > loaded.weak())
         unclear = loaded.at_the_limit(impulses)
-        carried = where(stays[:, None], impulses, 0)
+        held = lax.stop_gradient(where(stays, problem.push(impulses), 0)[:, None] * problem.normal)
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
@@ -222,11 +222,13 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         unresolved = jnp.sum(active & lax.stop_gradient(unclear)).astype(jnp.int32)
     w, q = u[:, :-1], u[:, -1]
     _, _, left = problem.at_end(w, q)
-    shift = contacts.move(q[:, None] * problem.normal)
     left = where(active, contacts.dt * left, 0)
-    push, carried = (problem.push(y)[:, None] * problem.normal for y in (w + carried, lax.stop_gradient(carried)))
-    support, carried = contacts.move(push), lax.stop_gradient(contacts.move(carried))
-    return Rest(contacts.move(w), push, support, carried, contacts.dt * shift, on, left, unresolved)
+    push = problem.push(w)[:, None] * problem.normal
+    push = push if held is None else push + held
+    moved = contacts.move(jnp.concatenate([w, push, q[:, None] * problem.normal], axis=1))
+    kick, support, shift = jnp.split(moved, 3, axis=1)
+    carried = None if held is None else lax.stop_gradient(contacts.move(held))
+    return Rest(kick, push, support, carried, contacts.dt * shift, on, left, unresolved)
 
 
 def loads(problem: Problem, small: Array) -> Array:

@@ -167,7 +167,8 @@ def hold(
         rest = at_rest(problem, small)
     else:
         rest = at_rest(problem, small, contacts.relative(load) + surface)
-        upward, already = unit(rest.carried), jnp.sum(unit(rest.carried) * (v + dv - load), axis=-1, keepdims=True)
+        upward = unit(jnp.asarray(rest.carried))
+        already = jnp.sum(upward * (v + dv - load), axis=-1, keepdims=True)
         rest = rest._replace(support=rest.support + (already - lax.stop_gradient(already)) * upward)
     far = (contacts.reach > 0) & (small > 0.05 * contacts.reach)  # from the origin: nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | (stays & far)).astype(jnp.int32)
