@@ -33,6 +33,8 @@ WRONG_ONCE = [
     scene(  # a rounding that pushes had another derivative where reverse mode computes it again
         [(0.2, 0.1), (0.2, 0.3)], [(0.5, 0.0), (0.0, 0.0)], mass=(0.5, 1.0), gravity=-10.0, restitution=0.5, dt=1 / 60
     ),
+    # one lies on another that meets the floor, without a load: nothing holds it, and roundings do not push
+    scene([(0.3, 0.1), (0.3, 0.1 * 3)], [(0.0, -0.5), (0.0, 0.0)], gravity=0.0, restitution=0.0, friction=0.3),
 ]  # fmt: skip
 
 
