@@ -131,6 +131,16 @@ def test_derivative_of_a_ball_that_a_wall_takes_off_its_floor(step):
     assert end(velocity)[1] > 0.103
 
 
+def test_contact_with_nothing_adds_nothing_to_the_solve():
+    state = jeuler.ParticleState([[0.0, 1.0]], [[0.5, 0.0]])
+    ends = [
+        jeuler.simulate(jeuler.Scene((GRAVITY,), effects), state, dt=0.1, num_steps=3, step=IMPLICIT).y
+        for effects in ((), (Collisions(),))
+    ]
+    np.testing.assert_allclose(ends[1].position, ends[0].position, rtol=1e-12)
+    np.testing.assert_allclose(ends[1].velocity, ends[0].velocity, rtol=1e-12)
+
+
 def test_net_of_many_balls_stands_on_the_floor():
     """More unknowns than are solved for with a matrix: the floor carries the whole net, each vertical layer its part."""
     wide, high = 8, 9
