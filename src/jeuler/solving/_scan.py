@@ -120,7 +120,7 @@ def solve(
 
     The time comes from an integer step counter, never from an accumulated sum. Works under jit, vmap, grad, jacfwd,
     hessian and grad of grad as it is. Outside of these a long run is done in pieces of about 0.1 s, so that Ctrl-C
-    stops it, with the same numbers.
+    stops it, with the same numbers to rounding.
 
     Args:
       f: vector field, ``f(t, y, args) -> dy/dt``, of the structure, shapes and dtypes of y.
@@ -147,8 +147,8 @@ def solve(
       progress: True shows a bar with an estimate of the end; a function is called as ``progress(step, num_steps)``
         about ten times a second, and what it raises ends the run. Not under jit, vmap or grad, nor with "reversible".
       resume: path of a folder in which the run keeps its saved frames and its last state, and from which the same call
-        goes on, after a kill or for more steps, with the numbers of a run in one go. The leaves of ``y`` are then read
-        from disk where they are indexed or converted. It needs zarr, ``pip install 'jeuler[runs]'``.
+        goes on, after a kill or for more steps, with the numbers of a run in one go to the bit. The leaves of ``y`` are
+        then read from disk where they are indexed or converted. It needs zarr, ``pip install 'jeuler[runs]'``.
       checkpoint_every: steps between two states on disk; None for one each 10 s.
     Returns: `Solution`, saved states with leading axis num_steps // save_every + 1, initial value first.
     Raises: ValueError, before tracing, naming the argument, what was expected and what came.
