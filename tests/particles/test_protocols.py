@@ -6,6 +6,7 @@ from typing import get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jeuler
@@ -56,3 +57,35 @@ def test_an_effect_of_ones_own_gets_what_it_needs():
         jeuler.simulate(scene, state, dt=0.1, num_steps=3)
     run = jeuler.simulate(scene, state, dt=0.1, num_steps=3, t0=10.0, key=jax.random.key(0))
     assert run.y.position[1:, 0, 0].tolist() == [10.0, 11.0, 12.0]
+
+
+@pytest.mark.parametrize("parts", [1, 3], ids=lambda parts: f"extrapolated from {parts}")
+def test_an_effect_of_ones_own_in_the_solve(parts):
+    """It pulls as gravity does, as much as it said at the start of the whole step."""
+    told, told_acceleration = [], []
+
+    class Pull:
+        needs = ("the solve",)
+
+        def __call__(self, t, dt, previous, state, key, *, acceleration=None):
+            told_acceleration.append(acceleration is not None)
+            return state
+
+        def answer(self, t, dt, state, acceleration, stays):
+            told.append(stays is not None)
+            return lambda velocity: jnp.full_like(velocity, dt) * (-9.8 if stays is None else stays)
+
+        def touching(self, t, dt, state, acceleration):
+            return jnp.asarray(-9.8)
+
+    base = jeuler.linearly_implicit_euler_step
+    step = base if parts == 1 else jeuler.extrapolated_euler(parts, step=base)
+    state = jeuler.ParticleState([[0.0, 1.0]], [[0.5, 0.0]])
+    ran, expected = (
+        jeuler.simulate(scene, state, dt=0.1, num_steps=5, step=step).y
+        for scene in (jeuler.Scene(effects=(Pull(),)), jeuler.Scene((jeuler.Gravity([-9.8, -9.8]),)))
+    )
+    np.testing.assert_allclose(ran.position, expected.position, rtol=1e-12)
+    np.testing.assert_allclose(ran.velocity, expected.velocity, rtol=1e-12)
+    assert set(told) == {parts > 1}
+    assert told_acceleration[-1]

@@ -106,7 +106,7 @@ class Collisions:
         if previous is None:
             previous = dataclasses.replace(state, position=state.position - dt * state.velocity)
         x, v = previous.position, previous.velocity
-        contacts = Contacts(self, jnp.asarray(t - dt), jnp.asarray(dt), x, state.mass, state.alive)
+        contacts = self._contacts(t - dt, dt, dataclasses.replace(state, position=x))
         position, velocity, unresolved = resolve(
             contacts, x, v, state.position, state.velocity, self._rounds(), acceleration=acceleration
         )
@@ -115,24 +115,29 @@ class Collisions:
         return dataclasses.replace(state, position=position, velocity=velocity, unresolved_contacts=count)
 
     def answer(
-        self, t: Any, dt: Any, state: Any, acceleration: Array, whole: tuple[Any, ...] | None = None
+        self, t: Any, dt: Any, state: Any, acceleration: Array, stays: Array | None = None
     ) -> Callable[[Array], Array]:
         """What contacts at rest add to the velocities at the end of a step from this state, given these velocities.
 
-        A part of a step has these arguments of the ``whole``: what touches at its start stays in touch in all parts, so
-        that they differ by their length alone.
+        A part of a step is told who ``stays`` in touch, (contact,): what is `touching` at the start of the whole.
         """
         if not self.colliders and not self.pairs:
             return jnp.zeros_like
+        return answer(self._contacts(t, dt, state), state.position, state.velocity, acceleration, stays)
 
-        def contacts(t: Any, dt: Any, state: Any) -> Contacts:
-            return Contacts(self, jnp.asarray(t), jnp.asarray(dt), state.position, state.mass, state.alive)
+    def touching(self, t: Any, dt: Any, state: Any, acceleration: Array) -> Array | None:
+        """Who touches at the start of a step from this state and does not bounce, (contact,).
 
-        here, stays = contacts(t, dt, state), None
-        if whole is not None and here.follows_all:
-            *began, first = whole
-            _, _, stays = at_start_of_fall(contacts(*began), began[2].position, began[2].velocity, first)
-        return answer(here, state.position, state.velocity, acceleration, stays)
+        It stays in touch in all parts of the step, so that they differ by their length alone. None where each part has
+        a list of contacts of its own.
+        """
+        contacts = self._contacts(t, dt, state)
+        if not contacts.count or not contacts.follows_all:
+            return None
+        return at_start_of_fall(contacts, state.position, state.velocity, acceleration)[-1]
+
+    def _contacts(self, t: Any, dt: Any, state: Any) -> Contacts:
+        return Contacts(self, jnp.asarray(t), jnp.asarray(dt), state.position, state.mass, state.alive)
 
     @property
     def writes(self) -> tuple[str, ...]:

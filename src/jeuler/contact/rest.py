@@ -45,7 +45,7 @@ class Rest(NamedTuple):
     kick: Array  # (particle, dim), what they add to the velocity, m/s
     push: Array  # (contact, dim), what each would add along its normal to its partners' relative velocity if alone, m/s
     support: Array  # (particle, dim), the normal part of the kick, and what is carried, m/s
-    carried: Array | None  # (particle, dim), normal forces that the velocities hold already, m/s; no derivative
+    carried: Array  # (particle, dim), normal forces that the velocities hold already, m/s; no derivative
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -227,7 +227,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     push = push if held is None else push + held
     moved = contacts.move(jnp.concatenate([w, push, q[:, None] * problem.normal], axis=1))
     kick, support, shift = jnp.split(moved, 3, axis=1)
-    carried = None if held is None else lax.stop_gradient(contacts.move(held))
+    carried = jnp.zeros_like(kick) if held is None else lax.stop_gradient(contacts.move(held))
     return Rest(kick, push, support, carried, contacts.dt * shift, on, left, unresolved)
 
 

@@ -167,7 +167,7 @@ def hold(
         rest = at_rest(problem, small)
     else:
         rest = at_rest(problem, small, contacts.relative(load) + surface)
-        upward = unit(jnp.asarray(rest.carried))
+        upward = unit(rest.carried)
         already = jnp.sum(upward * (v + dv - load), axis=-1, keepdims=True)
         rest = rest._replace(support=rest.support + (already - lax.stop_gradient(already)) * upward)
     far = (contacts.reach > 0) & (small > 0.05 * contacts.reach)  # from the origin: nobody can say whether they touch

@@ -120,12 +120,13 @@ class EffectHooks(Effect, Protocol):
     """Fields that it gives to every particle at each step: no other effect may write them."""
 
     needs: tuple[Need, ...]
-    """What it cannot do without: "key", for random numbers; "clock", ``clock=(n, t0)`` in place of a
-    keyword's default, n the steps taken before this one; "forward time", dt > 0; "prescribed pinned", mass inf of
-    prescribed particles as of pinned ones; "the solve", a place in the equation of steps that solve for their end:
-    ``answer(t, dt, state, acceleration)``, of the state at the start and the acceleration there, gives a function of
-    the velocities at the end, (particle, dim), to what is added to them, and the call gets
-    ``acceleration=`` too. And a place among the other effects: "the events", before the motion after those that let
+    """What it cannot do without: "key", for random numbers; "clock", ``clock=(n, t0)`` in place of a keyword's default,
+    n the steps taken before this one; "forward time", dt > 0; "prescribed pinned", mass inf of prescribed particles as
+    of pinned ones; "the solve", a place in the equation of steps that solve for their end: ``answer(t, dt, state,
+    acceleration, stays)``, of the state at the start and the acceleration there, gives a function of the velocities at
+    the end, (particle, dim), to what is added to them; ``stays`` is None, or in a part of a step what ``touching(t, dt,
+    state, acceleration)`` said at the start of the whole. Beside such steps the call gets ``acceleration=`` in place of
+    a keyword's default. And a place among the other effects: "the events", before the motion after those that let
     particles die and before births into their slots, after the motion after `Collisions`; "the last place", after all
     that act after the motion."""
 

@@ -70,35 +70,13 @@ class SceneStep:
             return advance_by(self.step, compensated=self.compensated)
         return advance_by(on_arrays(self.step, contact), compensated=self.compensated)
 
-    def contact_in_the_solve(self) -> Callable[..., VectorField] | None:
-        """What makes contact at rest part of the equation of a step that solves for its end; None where there is none.
-
-        ``in_step(f, t, y, dt, attributes)`` is f with it: v + dt f is the velocity after the forces, contact included.
-        A part of a step has the ``whole``, (t, y, dt), which says what touches.
-        """
-        in_the_solve = [effect for effect in self.scene.effects if needs(effect, "the solve")]
+    def contact_in_the_solve(self) -> InTheSolve | None:
+        """What puts contact at rest into the equation of a step that solves for its end; None where there is none."""
+        in_the_solve = tuple(effect for effect in self.scene.effects if needs(effect, "the solve"))
         explicit = getattr(self.step, "explicit", False)
         if not in_the_solve or explicit or not getattr(self.step, "solves_contact", True):
             return None
-
-        def in_step(f, t, y, dt, attributes, whole=None):
-            def at(t, y, dt):
-                x, v = y
-                mass = self.with_prescribed_pinned(t, jnp.broadcast_to(attributes.mass, (len(x),)), x.dtype)
-                return t, dt, ParticleState(x, v, mass, alive=attributes.alive), f(t, y, attributes)[1]
-
-            (_, velocity), whole = y, None if whole is None else at(*whole)
-            answers = [effect.answer(*at(t, y, dt), whole) for effect in in_the_solve]
-
-            def with_contact(t, y, attributes):
-                slope, acceleration = f(t, y, attributes)
-                for answer in answers:
-                    acceleration = acceleration + answer(velocity + dt * acceleration) / dt
-                return slope, acceleration
-
-            return with_contact
-
-        return in_step
+        return InTheSolve(in_the_solve, self.with_prescribed_pinned)
 
     def __call__(self, n: Array, t: Array, carried: tuple[Any, Any]) -> tuple[Any, Any]:
         """What is carried, (state in parts, remainder of its sums), after the step from t, the n-th from 0."""
@@ -214,25 +192,62 @@ def with_its_needs(effect: Any, key: Array | None, n: Any, t0: Array) -> Callabl
 
 
 @dataclasses.dataclass(frozen=True)
+class InTheSolve:
+    """Effects that have a place in the equation of a step which solves for its end, as contact has.
+
+    Called as ``(f, t, y, dt, attributes)``: f with them, so that v + dt f is the velocity after all forces.
+    """
+
+    effects: tuple[Any, ...]
+    with_prescribed_pinned: Callable[..., Array]  # of (t, mass, dtype), the mass
+
+    def __call__(
+        self, f: VectorField, t: Any, y: Any, dt: Any, attributes: Any, touching: tuple[Any, ...] | None = None
+    ) -> VectorField:
+        (_, velocity), start = y, self._start(f, t, y, dt, attributes)
+        stays = touching or (None,) * len(self.effects)
+        answers = [effect.answer(*start, which) for effect, which in zip(self.effects, stays, strict=True)]
+
+        def with_them(t, y, attributes):
+            slope, acceleration = f(t, y, attributes)
+            for answer in answers:
+                acceleration = acceleration + answer(velocity + dt * acceleration) / dt
+            return slope, acceleration
+
+        return with_them
+
+    def touching(self, f: VectorField, t: Any, y: Any, dt: Any, attributes: Any) -> tuple[Any, ...]:
+        """What each of them says touches through the whole of a step from (t, y)."""
+        start = self._start(f, t, y, dt, attributes)
+        return tuple(effect.touching(*start) for effect in self.effects)
+
+    def _start(self, f: VectorField, t: Any, y: Any, dt: Any, attributes: Any) -> tuple[Any, ...]:
+        """Time, size of the step, state and acceleration at its start."""
+        x, v = y
+        mass = self.with_prescribed_pinned(t, jnp.broadcast_to(attributes.mass, (len(x),)), x.dtype)
+        return t, dt, ParticleState(x, v, mass, alive=attributes.alive), f(t, y, attributes)[1]
+
+
+@dataclasses.dataclass(frozen=True)
 class FieldInStep:
     """A vector field on arrays that is another one within a step, see `jeuler.steps.implicit.in_step`."""
 
     field: VectorField
-    changed: Callable[..., VectorField]
-    whole: Any = None
+    changed: InTheSolve
+    touching: tuple[Any, ...] | None = None
 
     def __call__(self, t: Any, y: Any, args: Any) -> Any:
         return self.field(t, y, args)
 
     def in_step(self, t: Any, y: Any, dt: Any, args: Any) -> VectorField:
-        return self.changed(self.field, t, y, dt, args, self.whole)
+        return self.changed(self.field, t, y, dt, args, self.touching)
 
-    def within(self, t: Any, y: Any, dt: Any) -> FieldInStep:
+    def within(self, t: Any, y: Any, dt: Any, args: Any) -> FieldInStep:
         """The field in parts of the step from (t, y)."""
-        return dataclasses.replace(self, whole=(t, y, dt))
+        return dataclasses.replace(self, touching=self.changed.touching(self.field, t, y, dt, args))
 
 
-def on_arrays(step: Step, changed: Callable[..., VectorField] | None = None) -> Step:
+def on_arrays(step: Step, changed: InTheSolve | None = None) -> Step:
     """A step that may do arithmetic on (particle, dim) arrays, for the motion by components.
 
     Within the step the vector field f is ``changed(f, t, y, dt, attributes)``, for steps that ask for it.

@@ -97,7 +97,8 @@ class ExtrapolatedStep:
 
         One vmapped batch of lanes, k substeps deep. Row k has a lane to itself, rows j and k - j share one.
         """
-        f = f.within(t, y, dt) if hasattr(f, "within") else f  # what acts through the step is the same in all rows
+        if hasattr(f, "within"):  # what acts through the step is the same in all rows
+            f = f.within(t, y, dt, args)
         lanes = Lanes.of(self.order)
         increment = getattr(self.base, "increment", None) or self._difference
 
