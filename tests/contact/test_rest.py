@@ -99,6 +99,29 @@ def test_friction_below_its_limit_moves_nothing_and_has_gradient_zero(step):
     np.testing.assert_allclose(slope, 0, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "step",
+    [jeuler.euler_step, jeuler.symplectic_euler_step, jeuler.implicit_euler_step, jeuler.linearly_implicit_euler_step],
+    ids=lambda step: step.__name__,
+)
+def test_a_load_that_rest_alone_does_not_determine_is_counted_where_it_slides(step):
+    """A ball stands on one that slides into a wall, and is dragged against that wall: what the wall's friction carries
+    of it, any share up to its limit, does not rub on the lower ball. At rest, and without friction, all shares do the
+    same."""
+    balls, wall = jnp.array([[0.1, 0.1], [0.1, 0.3]]), Plane([0.0, 0.0], [1.0, 0.0])
+
+    @jax.jit
+    @jax.vmap
+    def unresolved(speed, friction):
+        corner = Collisions((FLOOR, wall), [(1, 0)], radius=0.1, restitution=0.5, friction=friction)
+        velocity = jnp.zeros((2, 2)).at[0, 0].set(speed)
+        return run(corner, balls, velocity, dt=0.02, num_steps=1, mass=0.5, step=step).unresolved_contacts
+
+    counts = unresolved(jnp.array([-0.5, 0.0, -0.5]), jnp.array([0.3, 0.3, 0.0]))
+    assert counts[0] > 0
+    np.testing.assert_array_equal(counts[1:], 0)
+
+
 def test_point_slides_over_a_flush_edge():
     end = run(Collisions((FLOOR, Box([2.0, -1.0], 1.0))), [[0.0, 0.0]], [[1.0, 0.0]], dt=0.01, num_steps=200).y
     np.testing.assert_allclose(end.position[-1, 0], [2.0, 0.0], atol=1e-9)

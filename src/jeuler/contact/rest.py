@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.ad_checkpoint import checkpoint_name
 
@@ -33,9 +34,9 @@ from jeuler._core.vectors import length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import DENSE_UP_TO, Chosen, Contacts
+from jeuler.contact.linear import ITERATIONS, least_squares, matrix_of, solve_linear
 
-ITERATIONS = 400
-REFINEMENTS = 3
+UNSEEN = 1e-2  # of numbers around 1: more than what least squares leave
 REST = "contacts at rest"
 
 
@@ -194,8 +195,9 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
+        others = undetermined(loaded, impulses)
         stays = (jnp.abs(problem.gap) <= small + problem.weak()) & (loaded.push(impulses) > loaded.weak())
-        unclear = loaded.at_the_limit(impulses)
+        unclear = loaded.at_the_limit(impulses) | others
         held = lax.stop_gradient(where(stays, problem.push(impulses), 0)[:, None] * problem.normal)
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
@@ -215,10 +217,11 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         presses = pressed(w, velocity)
         on = lax.stop_gradient(presses | ((q > 0) & ((gap < -small) | (q > small) | ~active)))
         overlap = where(presses, 0, small)
-        u = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
+        u, unseen = _solve(lambda u: problem.residual(u, rate, on, overlap), start, anywhere(active))
         off = lax.stop_gradient(problem.residual(u, rate, on, overlap))  # Newton's step may have ended it
         off = jnp.minimum(error, jnp.maximum(length(off[:, :-1]) / rate, jnp.abs(off[:, -1])))
         unclear = unclear | (off > _tolerated(problem) + small) | problem.at_the_limit(u[:, :-1])
+        unclear = unclear | move_otherwise(contacts, unseen)
         unresolved = jnp.sum(active & lax.stop_gradient(unclear)).astype(jnp.int32)
     w, q = u[:, :-1], u[:, -1]
     _, _, left = problem.at_end(w, q)
@@ -304,78 +307,53 @@ def _accelerated(
     return u, error
 
 
-def _solve(residual: Callable[[Array], Array], guess: Array, needed: Array) -> Array:
-    """The root of the residual near the guess, and no worse than it; the guess where none is needed.
+def undetermined(problem: Problem, w: Array) -> Array:
+    """Which contacts, (contact,), may have other impulses than w by which particles move otherwise."""
+    contacts = problem.contacts
+    if contacts.alone:
+        return jnp.zeros_like(problem.active)
+    problem, none = lax.stop_gradient(problem), jnp.zeros_like(problem.gap)
+    rate = contacts.rate(problem.active)
+    u = jnp.concatenate([w, none[:, None]], axis=1)
+    _, unseen = _newton(lambda u: problem.residual(u, rate, none > 0, none), u, anywhere(problem.active))
+    return move_otherwise(contacts, unseen)
 
-    With few unknowns by one step of Newton's method, exact if the equations are the right ones and do not contradict
-    each other.
+
+def move_otherwise(contacts: Contacts | Chosen, unseen: Array) -> Array:
+    """Which contacts, (contact,), have a part in what the equations do not see, (contact, dim + 1), if that moves any.
+
+    Where nothing slides, several forces do the same. Where one of them is part of the load of a contact that slides,
+    friction there is another one, and with it the motion: which one, the iterations decide.
     """
+    moves = jnp.any(length(contacts.move(unseen[:, :-1])) > UNSEEN)
+    return moves & (length(unseen[:, :-1]) > UNSEEN)
 
-    def newton(residual, guess):
-        if guess.size > DENSE_UP_TO:
-            return guess, ()
 
-        def step(_):
-            value, slope = jax.linearize(residual, guess)
-            new = guess - _solve_linear(slope, value)
-            rounding = 1e3 * jnp.finfo(guess.dtype).eps * jnp.max(jnp.abs(guess))
-            better = jnp.max(jnp.abs(residual(new))) <= 1e-3 * jnp.max(jnp.abs(value)) + rounding
-            return where(better, new, guess)
-
-        return lax.cond(needed, step, lambda _: guess, None), ()
+def _solve(residual: Callable[[Array], Array], guess: Array, needed: Array) -> tuple[Array, Array]:
+    """The root of the residual near the guess, and no worse than it; the guess where none is needed. And what `_newton`
+    says of others."""
 
     def tangent_solve(slope, b):
-        return lax.cond(needed, lambda b: _solve_linear(slope, b), lambda b: b, b)
+        return lax.cond(needed, lambda b: solve_linear(slope, b), lambda b: b, b)
 
-    return root(residual, guess, newton, tangent_solve, label=REST)[0]
-
-
-def _conjugate_gradients(matvec: Callable[[Array], Array], b: Array) -> Array:
-    """x that makes |matvec(x) - b| least, by conjugate gradients on the normal equations; it does not need an inverse.
-
-    Source: A. Bjorck, Numerical Methods for Least Squares Problems, 1996, sect. 7.4.1 (CGLS).
-    """
-    transposed = jax.linear_transpose(matvec, b)
-
-    def one(state):
-        x, r, p, size, k = state
-        change = matvec(p)
-        alpha = size / jnp.sum(change**2)
-        x, r = x + alpha * p, r - alpha * change
-        (s,) = transposed(r)
-        new = jnp.sum(s**2)
-        return x, r, s + new / size * p, new, k + 1
-
-    (s,) = transposed(b)
-    first = jnp.sum(s**2)
-    enough = jnp.maximum(1e-10, jnp.finfo(b.dtype).eps) ** 2 * first
-    state = jnp.zeros_like(b), b, s, first, 0
-    return lax.while_loop(lambda state: (state[3] > enough) & (state[4] < ITERATIONS), one, state)[0]
+    return root(residual, guess, functools.partial(_newton, needed=needed), tangent_solve, label=REST)
 
 
-def _solve_linear(slope: Callable[[Array], Array], b: Array) -> Array:
-    """slope^-1 b, by least squares; where contacts are redundant, some forces that do the same."""
-    if b.size > DENSE_UP_TO:
-        return lax.custom_linear_solve(slope, b, _conjugate_gradients, transpose_solve=_conjugate_gradients)
-    n = b.size
-    matrix = jax.vmap(lambda d: slope(d.reshape(b.shape)).ravel())(jnp.eye(n, dtype=b.dtype)).T
-    small = 1e3 * jnp.finfo(b.dtype).eps * jnp.eye(n, dtype=b.dtype)
+def _newton(residual: Callable[[Array], Array], guess: Array, needed: Array) -> tuple[Array, Array]:
+    """With few unknowns one step of Newton's method, exact if the equations are the right ones and do not contradict
+    each other; and what they do not see of a vector of numbers around 1, by which other answers may differ."""
+    unseen = jnp.zeros_like(guess)
+    if guess.size > DENSE_UP_TO:
+        return guess, unseen
 
-    def least_squares(m):
-        half = lax.linalg.cholesky(m.T @ m + small)
+    def step(_):
+        value, slope = jax.linearize(residual, guess)
+        matrix = matrix_of(slope, guess)
+        any_one = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.5, guess.size), guess.dtype)
+        change, seen = least_squares(matrix)(jnp.stack([value.ravel(), matrix @ any_one], axis=1)).T
+        new = guess - change.reshape(guess.shape)
+        rounding = 1e3 * jnp.finfo(guess.dtype).eps * jnp.max(jnp.abs(guess))
+        better = jnp.max(jnp.abs(residual(new))) <= 1e-3 * jnp.max(jnp.abs(value)) + rounding
+        return where(better, new, guess), (any_one - seen).reshape(guess.shape)
 
-        def solve(_, b):
-            def refine(_, x):
-                y = (m.T @ (b - m @ x))[:, None]
-                y = lax.linalg.triangular_solve(half, y, left_side=True, lower=True)
-                return x + lax.linalg.triangular_solve(half, y, left_side=True, lower=True, transpose_a=True)[:, 0]
-
-            return lax.fori_loop(0, 1 + REFINEMENTS, refine, jnp.zeros_like(b))
-
-        return solve
-
-    fixed = lax.stop_gradient(matrix)
-    solved = lax.custom_linear_solve(
-        lambda d: matrix @ d, b.ravel(), least_squares(fixed), transpose_solve=least_squares(fixed.T)
-    )
-    return solved.reshape(b.shape)
+    return lax.cond(needed, step, lambda _: (guess, unseen), None)
