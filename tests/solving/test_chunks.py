@@ -139,7 +139,8 @@ def test_progress_that_cannot_be_told_is_refused(call, message):
 
 
 SCRIPT = """
-import jax, jeuler, sys, time
+import jax, jeuler, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs begin without it
 scene = jeuler.Scene((jeuler.Springs([[0, 1]], ks=1.0, kd=0.0, rest_length=1.0),))
 state = jeuler.ParticleState([[0.0, 0.0], [1.5, 0.0]], [[0.0, 0.0], [0.0, 0.0]])
 how = {"dt": 1e-3, "num_steps": 2**31 + 2**24, "save_every": 2**24}

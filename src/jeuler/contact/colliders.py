@@ -30,6 +30,15 @@ def normal_and_speed(collider: Collider, t: Any, point: Array) -> tuple[Array, A
     return unit(slope), recession
 
 
+def moves(collider: Collider, dim: int) -> bool:
+    """Whether its distance depends on the time."""
+    if isinstance(collider, _Shape):
+        return any(callable(value) for value in vars(collider).values())
+    program = jax.make_jaxpr(collider)(jnp.zeros(()), jnp.zeros(dim)).jaxpr
+    time, _ = program.invars
+    return any(x is time for used in (program.outvars, *(equation.invars for equation in program.eqns)) for x in used)
+
+
 class _Shape:
     """What the shapes share: parameters as arrays, places that may move, a check of their dimension."""
 
@@ -48,7 +57,7 @@ class _Shape:
     @property
     def convex(self) -> bool:
         """Whether the solid is convex and does not move, so that its distance along a straight path is convex."""
-        return not any(callable(value) for value in vars(self).values()) and not getattr(self, "inside", False)
+        return not moves(self, 0) and not getattr(self, "inside", False)
 
     def check(self, dim: int) -> None:
         for name, value in vars(self).items():

@@ -86,6 +86,7 @@ class Contacts:
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
         self.resting: Array | bool = False  # (contact,), which are held from the start of the step
+        self.gained: Array | float = 0.0  # (contact,), m/s, by how much faster its surface recedes where the step ends
         self.axis: str | None = getattr(collisions, "axis", None)  # of the devices that share the particles
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

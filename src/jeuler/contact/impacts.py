@@ -101,7 +101,7 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     normal, bend = look.normal, contacts.relative(path.bend)
     v = look.speed / contacts.dt + look.recession[:, None] * normal
     change = bounce(v, normal, where(plastic, 0, contacts.restitution), contacts.friction)
-    into = jnp.sum(bend * normal, axis=-1)
+    into = jnp.sum(bend * normal, axis=-1) + contacts.dt * contacts.gained
     stays = plastic & (into < rounding_of_speed(contacts, path))  # without a push too, as where a solve holds it
     held = where(stays, -into, 0)[:, None] * normal  # no more push into what it stays on
 

@@ -169,16 +169,18 @@ class Problem(NamedTuple):
         return jnp.concatenate([unmoved, where(on, left + overlap, q)[:, None]], axis=1)
 
 
-def at_rest(problem: Problem, small: Array, load: Array | None = None) -> Rest:
+def at_rest(problem: Problem, small: Array, load: Array | None = None, may_open: Array | None = None) -> Rest:
     """The answer of the contacts that are active. Overlaps of ``small``, (contact,), m, are none.
 
     Where its velocities may hold this answer already, ``load``, (contact, dim), are those that do not: what presses
-    under them, and touches at both ends of the step, acts.
+    under them, and touches at both ends of the step, acts. A surface that gains speed leaves a gap of up to
+    ``may_open``, (contact,), m, which is closed.
     """
     own, kept = problem.listed()
     if own is problem:
-        return _at_rest(problem, small, load)
-    rest = _at_rest(own, small.at[kept].get(mode="clip"), None if load is None else load.at[kept].get(mode="clip"))
+        return _at_rest(problem, small, load, may_open)
+    of_kept = [None if y is None else y.at[kept].get(mode="clip") for y in (small, load, may_open)]
+    rest = _at_rest(own, *of_kept)
     without = jnp.sum(problem.close()) - jnp.sum(own.close())
     on = jnp.zeros(len(small), bool).at[kept].set(rest.on, mode="drop")
     gap = jnp.zeros_like(small).at[kept].set(rest.gap, mode="drop")
@@ -186,7 +188,7 @@ def at_rest(problem: Problem, small: Array, load: Array | None = None) -> Rest:
     return rest._replace(push=push, on=on, gap=gap, unresolved=rest.unresolved + without.astype(jnp.int32))
 
 
-def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
+def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array | None) -> Rest:
     contacts, active = problem.contacts, problem.active
     small = small / contacts.dt
 
@@ -196,7 +198,8 @@ def _at_rest(problem: Problem, small: Array, load: Array | None) -> Rest:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
         others = undetermined(loaded, impulses)
-        stays = (jnp.abs(problem.gap) <= small + problem.weak()) & (loaded.push(impulses) > loaded.weak())
+        near = small if may_open is None else may_open / contacts.dt
+        stays = (jnp.abs(problem.gap) <= near + problem.weak()) & (loaded.push(impulses) > loaded.weak())
         unclear = loaded.at_the_limit(impulses) | others
         held = lax.stop_gradient(where(stays, problem.push(impulses), 0)[:, None] * problem.normal)
 

@@ -42,13 +42,15 @@ def rounding(path: Path) -> Array:
 def impulsive_limit(contacts: Contacts, normal: Array, path: Path) -> Array:
     """The speed of approach, m a step, up to which an impact is one that the step itself can make: it is plastic.
 
+    By its forces, or by how much the speed of a surface changes in it.
+
     Among many contacts each partner may be held by others, so that the forces on the other one make it.
     """
     if contacts.many:
         made = contacts.both(jnp.add, length(path.bend))
     else:
         made = jnp.abs(jnp.sum(contacts.relative(path.bend) * normal, axis=-1))
-    return 1.001 * made + rounding_of_speed(contacts, path)
+    return 1.001 * (made + contacts.dt * jnp.abs(contacts.gained)) + rounding_of_speed(contacts, path)
 
 
 def convex_stride(gap: Array, slope: Array, bend: Array) -> Array:
@@ -82,7 +84,7 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     lowest = where(now, start - 1, start)
     turn = length(contacts.relative(path.bend))
     fastest = length(first.speed) + turn
-    stride = fastest + jnp.abs(first.recession) * contacts.dt
+    stride = fastest + (jnp.abs(first.recession) + jnp.abs(contacts.gained)) * contacts.dt
     safe_stride = where(stride > 0, stride, 1)
     convex = contacts.convex()
     searched = contacts.possible & (now | (first.gap <= stride))
@@ -113,6 +115,7 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     s, look, apart, newtons, _ = lax.while_loop(go_on, advance, state)
     given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
     at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small - 1e-6 * look.slope) & (s > lowest)
+    at_root = at_root & (~now | (look.slope < 0.5 * first.slope))  # where it began to fall in the past is no impact
     given_up = given_up | (searched & apart & ~at_root & (s <= 1) & (look.gap < -small))
     by_rest = rests & (s - 2 * small / where(at_root, look.slope, -1) >= 1)  # the gap that its solve has closed
     happens = searched & (now | (apart & at_root & (s <= 1) & ~by_rest))

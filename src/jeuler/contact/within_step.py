@@ -15,6 +15,7 @@ from jeuler._core.choice import where
 from jeuler._core.vectors import length, unit
 from jeuler._jax.anywhere import where_needed
 from jeuler._jax.found import found, found_p
+from jeuler.contact.colliders import moves
 from jeuler.contact.contacts import THERE, Contacts, Look
 from jeuler.contact.impacts import by_chance, go_through, schedule
 from jeuler.contact.paths import Path, free_path, share_of_the_force
@@ -60,10 +61,12 @@ def _resolve(
 ) -> tuple[Array, Array, Array]:
     displacement, dv = x_free - x, v_free - v
     theta = decided(share_of_the_force(x, displacement, v, dv, contacts.dt, contacts.total))
-    contacts.near(free_path(x, displacement, dv, contacts.dt))
+    free = free_path(x, displacement, dv, contacts.dt)
+    contacts.near(free)
+    contacts.gained, receded = motion_of_surfaces(contacts, free)
     slow = _slow(contacts, dv)
 
-    path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, load)
+    path, v_end, touched, unresolved, lost = hold(contacts, x, v, displacement, dv, theta, slow, load, receded)
     if load is not None:  # of a step that holds what rests, the forces cancel
         slow = slow + _slow(contacts, path.support / contacts.dt)
     contacts.lift_off(path)
@@ -122,10 +125,11 @@ def answer(
     """
     (gap, _, normal, recession, _), small, touching = at_start_of_fall(contacts, x, v, acceleration)
     stays = touching if stays is None else stays
-    standing, forced = jnp.zeros((len(x), 1), x.dtype), contacts.largest(length(acceleration)) > 0
+    standing, forced = jnp.zeros((len(x), 1), x.dtype), is_forced(contacts, acceleration)
+    surface = (recession + contacts.gained)[:, None] * normal + contacts.landing(gap, normal)
 
     def kick(u):
-        velocity = contacts.relative(u) + recession[:, None] * normal + contacts.landing(gap, normal)
+        velocity = contacts.relative(u) + surface
         problem = Problem.of(contacts, normal, velocity, jnp.zeros_like(gap), standing, stays, gap * 0, forced)
         return at_rest(problem, small).kick
 
@@ -137,7 +141,33 @@ def at_start_of_fall(contacts: Contacts, x: Array, v: Array, acceleration: Array
     dv = contacts.dt * acceleration
     path = free_path(x, contacts.dt * (v + dv / 2), dv, contacts.dt)
     contacts.near(path)
+    contacts.gained, _ = motion_of_surfaces(contacts, path)
     return at_start(contacts, path, _slow(contacts, dv))
+
+
+def motion_of_surfaces(contacts: Contacts, path: Path) -> tuple[Array | float, Array | float]:
+    """By how much faster each surface recedes where the step ends, m/s, and how far it has receded then, m, (contact,):
+    from the place where this path ends."""
+    if not any(moves(collider, contacts.dim) for collider in contacts.colliders):
+        return 0.0, 0.0
+
+    def of(collider):
+        if not moves(collider, contacts.dim):
+            return jnp.zeros((2, len(path.x)), path.x.dtype)
+        look = jax.vmap(jax.value_and_grad(collider), (None, 0))
+        start, end = path.position(jnp.zeros_like(path.s)), path.position(jnp.ones_like(path.s))
+        _, before = look(contacts.t0, start)
+        first, _ = look(contacts.t0, end)
+        last, after = look(contacts.t0 + contacts.dt, end)
+        return jnp.stack([after - before, last - first])
+
+    walls = [of(collider) for collider in contacts.colliders]
+    return tuple(jnp.concatenate([*walls, jnp.zeros((2, len(contacts.i)), path.x.dtype)], axis=1))
+
+
+def is_forced(contacts: Contacts, acceleration: Array) -> Array:
+    """Whether anything presses by more than rounding: an acceleration, (particle, dim), or that of a surface."""
+    return contacts.largest(length(acceleration)) + contacts.largest(jnp.abs(contacts.gained)) > 0
 
 
 def _end(path: Path) -> tuple[Array, Array]:
@@ -154,19 +184,21 @@ def hold(
     theta: Array,
     slow: Array,
     load: Array | None,
+    receded: Array | float,
 ) -> tuple[Path, Array, Array, Array, Array]:
     """The paths with the forces of what touches at the start and does not bounce, the velocity at their end, who is
     touched by them, the number of contacts that are not resolved, and who has a collider without a distance there."""
     (gap, _, normal, recession, _), small, stays = at_start(contacts, free_path(x, displacement, dv, contacts.dt), slow)
-    surface = recession[:, None] * normal + contacts.landing(gap, normal)
+    surface = (recession + contacts.gained)[:, None] * normal + contacts.landing(gap, normal)
     end_speed = contacts.relative(v + dv) + surface
-    gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + contacts.dt * recession
-    forced = contacts.largest(length(dv if load is None else load - v)) > 0
+    gap_end = gap + jnp.sum(contacts.relative(displacement) * normal, axis=-1) + receded
+    forced = is_forced(contacts, dv if load is None else load - v)
     problem = Problem.of(contacts, normal, end_speed, gap_end / contacts.dt, theta, stays, gap / contacts.dt, forced)
     if load is None:
         rest = at_rest(problem, small)
     else:
-        rest = at_rest(problem, small, contacts.relative(load) + surface)
+        may_open = small + contacts.dt * jnp.abs(contacts.gained)
+        rest = at_rest(problem, small, contacts.relative(load) + surface, may_open)
         upward = unit(rest.carried)
         already = jnp.sum(upward * (v + dv - load), axis=-1, keepdims=True)
         rest = rest._replace(support=rest.support + (already - lax.stop_gradient(already)) * upward)
