@@ -30,7 +30,8 @@ class Collisions:
     Impacts are found at their time within the step and followed one after the other, as many as there are; the rest of
     the step is travelled with the new velocity, so that values and gradients through a bounce are those of the exact
     motion, and a thin obstacle is not missed. What touches at the start of a step and does not come together faster
-    than the forces of one step can make it rests: contact forces hold it through the step, stacks and piles too.
+    than the forces of one step, or the speed that a surface gains in it, can make it rests: contact forces hold it
+    through the step, stacks and piles too.
     Overlaps of what rests are closed by displacements. What could not be resolved is counted in
     ``Solution.unresolved_contacts``. Beside the library's implicit steps what rests is part of the solve. Particles do
     not collide with each other unless ``pairs`` says so. Pinned particles (mass = inf) and prescribed ones are never

@@ -13,10 +13,10 @@ from jax import Array, lax
 from jeuler._core.choice import where
 from jeuler._core.vectors import direction, length, total, unit
 from jeuler.contact.colliders import Plane
+from jeuler.contact.linear import DENSE_UP_TO
 from jeuler.contact.paths import Path
 from jeuler.graphs.cells import rows_of_neighbours
 
-DENSE_UP_TO = 96  # unknowns of the contacts at rest that are solved for by a matrix
 NARROWER = 8  # reaches, each half of the one before, that are tried where pairs are more than there is room for
 WAY_OF_FORCES = 1e3  # of an approach that is none, is the way that the forces of a step make
 TOUCH, LIFT = 8, 16  # units in the last place of the coordinates

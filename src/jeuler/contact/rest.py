@@ -33,8 +33,8 @@ from jeuler._core.choice import where
 from jeuler._core.vectors import length
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
-from jeuler.contact.contacts import DENSE_UP_TO, Chosen, Contacts
-from jeuler.contact.linear import ITERATIONS, least_squares, matrix_of, solve_linear
+from jeuler.contact.contacts import Chosen, Contacts
+from jeuler.contact.linear import DENSE_UP_TO, ITERATIONS, least_squares, matrix_of, solve_linear
 
 UNSEEN = 1e-2  # of numbers around 1: more than what least squares leave
 REST = "contacts at rest"
