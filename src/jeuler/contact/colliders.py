@@ -33,7 +33,7 @@ def normal_and_speed(collider: Collider, t: Any, point: Array) -> tuple[Array, A
 def moves(collider: Collider, dim: int) -> bool:
     """Whether its distance depends on the time."""
     if isinstance(collider, _Shape):
-        return any(callable(value) for value in vars(collider).values())
+        return collider.moves
     program = jax.make_jaxpr(collider)(jnp.zeros(()), jnp.zeros(dim)).jaxpr
     time, _ = program.invars
     return any(x is time for used in (program.outvars, *(equation.invars for equation in program.eqns)) for x in used)
@@ -55,9 +55,13 @@ class _Shape:
                 store_as_float(self, name)
 
     @property
+    def moves(self) -> bool:
+        return any(callable(value) for value in vars(self).values())
+
+    @property
     def convex(self) -> bool:
         """Whether the solid is convex and does not move, so that its distance along a straight path is convex."""
-        return not moves(self, 0) and not getattr(self, "inside", False)
+        return not self.moves and not getattr(self, "inside", False)
 
     def check(self, dim: int) -> None:
         for name, value in vars(self).items():

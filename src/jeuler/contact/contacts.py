@@ -277,9 +277,8 @@ class Contacts:
             return self, numbers
         kept = jnp.nonzero(of, size=capacity, fill_value=self.count)[0]
         body = jnp.arange(self.particles, dtype=jnp.int32)
-        none = jnp.full(self.walls, self.particles, jnp.int32)  # a collider is one more particle, which stays
         i = jnp.concatenate([jnp.tile(body, len(self.colliders)), self.i.astype(jnp.int32)])
-        j = jnp.concatenate([none, self.j.astype(jnp.int32)])
+        j = jnp.pad(self.j.astype(jnp.int32), (self.walls, 0), constant_values=self.particles)  # one more, which stays
         i, j = (where(kept < self.count, k[kept], self.particles) for k in (i, j))
         return Chosen(i, j, jnp.pad(self.inverse_mass, (0, 1)), self.friction, self.dt, kept < self.count), kept
 

@@ -179,8 +179,11 @@ def at_rest(problem: Problem, small: Array, load: Array | None = None, may_open:
     own, kept = problem.listed()
     if own is problem:
         return _at_rest(problem, small, load, may_open)
-    of_kept = [None if y is None else y.at[kept].get(mode="clip") for y in (small, load, may_open)]
-    rest = _at_rest(own, *of_kept)
+
+    def of(y):
+        return None if y is None else y.at[kept].get(mode="clip")
+
+    rest = _at_rest(own, of(small), of(load), of(may_open))
     without = jnp.sum(problem.close()) - jnp.sum(own.close())
     on = jnp.zeros(len(small), bool).at[kept].set(rest.on, mode="drop")
     gap = jnp.zeros_like(small).at[kept].set(rest.gap, mode="drop")
