@@ -56,6 +56,7 @@ class _Shape:
 
     @property
     def moves(self) -> bool:
+        """Whether its place is a function of time."""
         return any(callable(value) for value in vars(self).values())
 
     @property
