@@ -215,6 +215,19 @@ def test_ball_that_slides_into_a_wall_stays_on_its_floor(step):
     assert (end.y.velocity[2, 0, 0] > 0) & (np.abs(end.y.velocity[-1, :, 0]) < 0.5).all()
 
 
+def test_stack_that_shears_gains_no_energy():
+    """The middle ball, between a heavier one and another, slides away: a landing on it is not held by what hardly
+    supports it, nor wedged aside (the lower ball got 2.7 m/s so)."""
+    middle = Collisions((FLOOR,), [(1, 0), (2, 0), (2, 1)], radius=0.1, restitution=1.0, friction=0.3)
+    position, velocity = [[0.2, 0.1], [0.2, 0.3], [0.2, 0.5]], [[0.0, 0.0], [-0.5, 0.0], [0.0, 0.0]]
+    mass, gravity = np.array([2.0, 0.5, 1.0]), jeuler.Gravity([0.0, -10.0])
+    how = {"forces": (gravity,), "mass": jnp.asarray(mass), "step": jeuler.heun_step}
+    end = run(middle, position, velocity, dt=1 / 60, num_steps=24, **how).y
+    energy = np.sum(mass * (np.sum(end.velocity**2, axis=-1) / 2 + 10.0 * end.position[..., 1]), axis=1)
+    assert (np.diff(energy) < 0.03).all()  # J; of the order of the step: mass (g dt)^2 = 0.1
+    assert np.abs(end.velocity[-1]).max() < 0.05
+
+
 def test_a_scene_does_not_depend_on_the_others_of_its_batch():
     """One of two has more impacts in a step than are followed, and is brought to rest; the other is not touched by it."""
     pairs = [(0, 1), (1, 2)]

@@ -21,6 +21,9 @@ from jeuler.contact.contacts import THERE, Contacts, Look, rows
 from jeuler.contact.paths import Path, along
 from jeuler.contact.search import Found, next_impacts, rounding, rounding_of_speed
 
+ENOUGH = 0.1  # of a push: the support that holds against it
+WEDGE = 1e-2  # of the response of free partners: one that is less would have to go far for a small push
+
 
 class Events(NamedTuple):
     """The next impact of each particle, or of each of several rounds."""
@@ -133,7 +136,8 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
     """What of a change of the relative bend along the normal, (contact, dim), falls to each particle, (particle, dim).
 
     By the masses; who is pushed against colliders that hold it moves along these, which take the rest of the push. Who
-    is pushed against balls that hold it, and no collider, stays, and the other partner takes all.
+    is pushed against balls that hold it, by a force of the push's order and no collider, stays, and the other partner
+    takes all. Nobody moves where a wedge would have to go far.
     """
     if contacts.alone:
         return contacts.move(change)
@@ -151,11 +155,13 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
     colliders = [of(up) for up in upward]
     for up in (*colliders, *colliders[:-1]):
         response = response - jnp.minimum(jnp.sum(up * response, axis=-1, keepdims=True), 0) * up
-    stays = of(on_balls) & (jnp.sum(of(path.support) * towards, axis=-1) < -0.5 * of(support))
+    push = jnp.sum(change * normal, axis=-1, keepdims=True)
+    holds = of(support) > ENOUGH * jnp.abs(lax.stop_gradient(push[:, 0]))
+    stays = of(on_balls) & holds & (jnp.sum(of(path.support) * towards, axis=-1) < -0.5 * of(support))
     first, second = where(stays[..., None], 0, response * of(contacts.inverse_mass)[..., None])
     both = jnp.sum((first - second) * normal, axis=-1, keepdims=True)
-    moves = both > 1e-6 * contacts.both(jnp.add, contacts.inverse_mass)[:, None]
-    push = jnp.sum(change * normal, axis=-1, keepdims=True) * where(moves, 1 / where(moves, both, 1), 0)
+    moves = both > WEDGE * contacts.both(jnp.add, contacts.inverse_mass)[:, None]
+    push = push * where(moves, 1 / where(moves, both, 1), 0)
     return contacts.gather(push * first, -push * second)
 
 
