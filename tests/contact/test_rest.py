@@ -228,6 +228,22 @@ def test_stack_that_shears_gains_no_energy():
     assert np.abs(end.velocity[-1]).max() < 0.05
 
 
+@pytest.mark.parametrize(
+    "step",
+    [jeuler.symplectic_euler_step, jeuler.rk4_step, jeuler.implicit_euler_step],
+    ids=lambda step: step.__name__,
+)
+def test_a_bounce_turns_friction_around_and_lets_nothing_sink(step):
+    """A ball slides from under another into a wall, and back: friction, which has held it back, does not drive it then,
+    and what comes to rest on the floor within a step is held there."""
+    corner = Collisions((FLOOR, Plane([0.0, 0.0], [1.0, 0.0])), [(1, 0)], radius=0.1, restitution=1.0, friction=0.3)
+    position, velocity = [[0.1, 0.1], [0.1, 0.3]], [[-1.0, 0.0], [1.0, 0.0]]
+    end = run(corner, position, velocity, dt=0.02, num_steps=12, step=step).y
+    energy = np.sum(end.velocity**2 / 2 + 9.8 * end.position * np.array([0.0, 1.0]), axis=(1, 2))
+    assert (np.diff(energy) < 1e-9).all()
+    assert (end.position[:, 0, 1] > 0.1 - 1e-9).all()
+
+
 def test_a_scene_does_not_depend_on_the_others_of_its_batch():
     """One of two has more impacts in a step than are followed, and is brought to rest; the other is not touched by it."""
     pairs = [(0, 1), (1, 2)]

@@ -117,7 +117,8 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     speed = where(hit, path.speed(own_s) + contacts.dt * kick, path.way)
     off = hit & leaves_its_support(path, own_s, speed)
     hold = hold - where(off, path.support, 0)
-    support = path.support + hold
+    support, turned = path.support + hold, hit & drives(path, own_s, speed)
+    hold = hold - where(turned, path.rub, 0)
     new = jnp.abs(along(hold, support)) > 1e-6 * sum(path.sizes()[1:])
     return Path(
         own_s,
@@ -128,6 +129,7 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
         path.hit | hit[:, 0],
         support,
         where(new, along(speed, support), path.ride),
+        where(turned, 0, path.rub),
         where(off, 0, path.ground) + contacts.of_colliders(where(now[:, None], held, zero)),
     )
 
@@ -163,6 +165,12 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
     moves = both > WEDGE * contacts.both(jnp.add, contacts.inverse_mass)[:, None]
     push = push * where(moves, 1 / where(moves, both, 1), 0)
     return contacts.gather(push * first, -push * second)
+
+
+def drives(path: Path, s: Array, speed: Array) -> Array:
+    """Whether the friction of what a particle stays on, which has held its dx/ds back, would drive it from s on."""
+    before, after = along(path.speed(s), path.rub), along(speed, path.rub)
+    return ((before <= 0) & (after > 0))[:, None]
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:

@@ -36,6 +36,7 @@ class Path(NamedTuple):
     hit: Array  # (particle,), whether there was an impact
     support: Array  # (particle, dim), what of bend are normal forces of contacts that it stays in, m
     ride: Array  # (particle,), dx/ds along the support while it stays, m a step
+    rub: Array  # (particle, dim), what of bend is friction of contacts that it stays in, m
     ground: Array  # (collider, particle, dim), how each collider pushes against bend, m; none where it has one contact
 
     def position(self, s: Array) -> Array:
@@ -51,14 +52,17 @@ class Path(NamedTuple):
         return self.way + (s - self.s)[:, None] * self.bend
 
 
-def free_path(x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = None, ground: Any = None) -> Path:
-    """The path of a step without impacts; ``kick`` is what of dv are normal forces of contacts that last, and
-    ``ground`` what each collider gives to push against, (collider, particle, dim), m/s."""
+def free_path(
+    x: Array, displacement: Array, dv: Array, dt: Any, kick: Any = None, rub: Any = None, ground: Any = None
+) -> Path:
+    """The path of a step without impacts; ``kick`` is what of dv are normal forces of contacts that last, ``rub`` their
+    friction, and ``ground`` what each collider gives to push against, (collider, particle, dim), m/s."""
     zero, bend = jnp.zeros(len(x), x.dtype), dt * dv
     ground = jnp.zeros((0, *x.shape), x.dtype) if ground is None else dt * ground
     way = displacement - bend / 2
     support, ride = (jnp.zeros_like(x), zero) if kick is None else (dt * kick, along(way + bend, dt * kick))
-    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, ride, ground)
+    rub = jnp.zeros_like(x) if rub is None else dt * rub
+    return Path(zero, x, way, bend, jnp.zeros_like(x), zero > 0, support, ride, rub, ground)
 
 
 def along(y: Array, support: Array) -> Array:

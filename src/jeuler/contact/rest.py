@@ -47,6 +47,7 @@ class Rest(NamedTuple):
     push: Array  # (contact, dim), what each would add along its normal to its partners' relative velocity if alone, m/s
     support: Array  # (particle, dim), the normal part of the kick, and what is carried, m/s
     carried: Array  # (particle, dim), normal forces that the velocities hold already, m/s; no derivative
+    rub: Array  # (particle, dim), the friction of the kick, and of what is carried, m/s
     shift: Array  # (particle, dim), by which they close overlaps, m
     on: Array  # (contact,), which of them act
     gap: Array  # (contact,), at the end of the step, where they act, m
@@ -196,7 +197,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
     small = small / contacts.dt
 
     stays = unclear = jnp.zeros_like(active)
-    held = None
+    held = held_rub = None
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
@@ -204,7 +205,9 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
         near = small if may_open is None else may_open / contacts.dt
         stays = (jnp.abs(problem.gap) <= near + problem.weak()) & (loaded.push(impulses) > loaded.weak())
         unclear = loaded.at_the_limit(impulses) | others
-        held = lax.stop_gradient(where(stays, problem.push(impulses), 0)[:, None] * problem.normal)
+        impulses = lax.stop_gradient(where(stays[:, None], impulses, 0))
+        held = problem.push(impulses)[:, None] * problem.normal
+        held_rub = impulses - held
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
@@ -233,11 +236,13 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
     _, _, left = problem.at_end(w, q)
     left = where(active, contacts.dt * left, 0)
     push = problem.push(w)[:, None] * problem.normal
-    push = push if held is None else push + held
-    moved = contacts.move(jnp.concatenate([w, push, q[:, None] * problem.normal], axis=1))
-    kick, support, shift = jnp.split(moved, 3, axis=1)
+    rub = w - push
+    if held is not None:
+        push, rub = push + held, rub + held_rub
+    moved = contacts.move(jnp.concatenate([w, push, rub, q[:, None] * problem.normal], axis=1))
+    kick, support, rub, shift = jnp.split(moved, 4, axis=1)
     carried = jnp.zeros_like(kick) if held is None else lax.stop_gradient(contacts.move(held))
-    return Rest(kick, push, support, carried, contacts.dt * shift, on, left, unresolved)
+    return Rest(kick, push, support, carried, rub, contacts.dt * shift, on, left, unresolved)
 
 
 def loads(problem: Problem, small: Array) -> Array:

@@ -80,7 +80,13 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     none = small + where(rests, contacts.open(slow), 0)
     touching = first.gap <= none
     held = jnp.inf if contacts.many else limit
-    now = touching & (-first.slope > where(rests, held, rounding_of_speed(contacts, path) + slow))
+    still = rounding_of_speed(contacts, path) + slow
+    approaches = touching & (-first.slope > where(rests, held, still))
+    busy = contacts.gather(*(sign * approaches.astype(path.s.dtype) for sign in (1, -1))) > 0
+    pulled = jnp.sum(contacts.relative(path.bend) * first.normal, axis=-1) + contacts.dt * contacts.gained
+    sinks = touching & ~rests & (jnp.abs(first.slope) <= still) & (pulled < -2 * still)  # at rest, and held no longer
+    sinks = sinks & ~contacts.both(jnp.logical_or, busy)  # impacts come first
+    now = approaches | sinks
     lowest = where(now, start - 1, start)
     turn = length(contacts.relative(path.bend))
     fastest = length(first.speed) + turn
@@ -115,7 +121,7 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     s, look, apart, newtons, _ = lax.while_loop(go_on, advance, state)
     given_up = searched & (newtons < NEWTON_STEPS) & (s <= 1)
     at_root = (look.slope < 0) & (jnp.abs(look.gap) <= small - 1e-6 * look.slope) & (s > lowest)
-    at_root = at_root & (~now | (look.slope < 0.5 * first.slope))  # where it began to fall in the past is no impact
+    at_root = at_root & ~sinks & (~now | (look.slope < 0.5 * first.slope))  # where it began to fall is no impact
     given_up = given_up | (searched & apart & ~at_root & (s <= 1) & (look.gap < -small))
     by_rest = rests & (s - 2 * small / where(at_root, look.slope, -1) >= 1)  # the gap that its solve has closed
     happens = searched & (now | (apart & at_root & (s <= 1) & ~by_rest))

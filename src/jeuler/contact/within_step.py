@@ -199,18 +199,26 @@ def hold(
     else:
         may_open = small + contacts.dt * jnp.abs(contacts.gained)
         rest = at_rest(problem, small, contacts.relative(load) + surface, may_open)
-        upward = unit(rest.carried)
-        already = jnp.sum(upward * (v + dv - load), axis=-1, keepdims=True)
-        rest = rest._replace(support=rest.support + (already - lax.stop_gradient(already)) * upward)
+        support, rub = (
+            y + changes_of(along_it, v + dv - load)
+            for y, along_it in ((rest.support, rest.carried), (rest.rub, lax.stop_gradient(rest.rub)))
+        )
+        rest = rest._replace(support=support, rub=rub)
     far = (contacts.reach > 0) & (small > 0.05 * contacts.reach)  # from the origin: nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | (stays & far)).astype(jnp.int32)
     touched = decided(_touched(contacts, rest.on) | jnp.any(rest.kick != 0, axis=-1))
     contacts.resting = stays
     moved = displacement + theta * contacts.dt * rest.kick
     ground = contacts.of_colliders(rest.push)
-    path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.support, ground)
+    path = free_path(x + rest.shift, moved, dv + rest.kick, contacts.dt, rest.support, rest.rub, ground)
     lost = decided(_touches_a_collider(contacts, jnp.isnan(gap)) & contacts.alive)
     return path, v + dv + rest.kick, touched, unresolved, lost
+
+
+def changes_of(direction: Array, y: Array) -> Array:
+    """0, with the derivative of the component of y, (particle, dim), along a direction."""
+    component = jnp.sum(unit(direction) * y, axis=-1, keepdims=True)
+    return (component - lax.stop_gradient(component)) * unit(direction)
 
 
 def at_start(contacts: Contacts, path: Path, slow: Array) -> tuple[Look, Array, Array]:
