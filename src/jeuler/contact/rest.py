@@ -197,7 +197,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
     small = small / contacts.dt
 
     stays = unclear = jnp.zeros_like(active)
-    held = held_rub = None
+    held: Array | None = None  # impulses that the velocities hold already
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
@@ -205,9 +205,7 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
         near = small if may_open is None else may_open / contacts.dt
         stays = (jnp.abs(problem.gap) <= near + problem.weak()) & (loaded.push(impulses) > loaded.weak())
         unclear = loaded.at_the_limit(impulses) | others
-        impulses = lax.stop_gradient(where(stays[:, None], impulses, 0))
-        held = problem.push(impulses)[:, None] * problem.normal
-        held_rub = impulses - held
+        held = lax.stop_gradient(where(stays[:, None], impulses, 0))
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it
         return lax.stop_gradient(active & (stays | (problem.push(w) > problem.push(velocity) + problem.weak())))
@@ -235,13 +233,13 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
     w, q = u[:, :-1], u[:, -1]
     _, _, left = problem.at_end(w, q)
     left = where(active, contacts.dt * left, 0)
-    push = problem.push(w)[:, None] * problem.normal
-    rub = w - push
-    if held is not None:
-        push, rub = push + held, rub + held_rub
+    held = jnp.zeros_like(w) if held is None else held
+    pressing = lax.stop_gradient(problem.push(held)[:, None] * problem.normal)
+    push = problem.push(w)[:, None] * problem.normal + pressing
+    rub = w + held - push
     moved = contacts.move(jnp.concatenate([w, push, rub, q[:, None] * problem.normal], axis=1))
     kick, support, rub, shift = jnp.split(moved, 4, axis=1)
-    carried = jnp.zeros_like(kick) if held is None else lax.stop_gradient(contacts.move(held))
+    carried = lax.stop_gradient(contacts.move(pressing))
     return Rest(kick, push, support, carried, rub, contacts.dt * shift, on, left, unresolved)
 
 
