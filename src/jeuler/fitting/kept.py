@@ -100,7 +100,7 @@ class Record:
         if not os.path.exists(self.path) or os.path.getsize(self.path) == 0:
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as kept:
+            with open(self.path, "rb") as opened, np.load(opened, allow_pickle=False) as kept:
                 found = {name: kept[name] for name in kept.files}
             mark = str(found["_mark"])
         except (zipfile.BadZipFile, KeyError, EOFError, OSError, ValueError, AttributeError):

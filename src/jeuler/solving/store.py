@@ -103,7 +103,7 @@ class Store:
                 )
             return None
         try:
-            with np.load(self.path / STATE) as file:
+            with open(self.path / STATE, "rb") as opened, np.load(opened) as file:  # NumPy leaves a broken one open
                 about = json.loads(str(file["about"]))
                 leaves = [file[f"leaf{n}"] for n in range(about["leaves"])]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
