@@ -19,7 +19,7 @@ from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import THERE, Contacts, Look, rows
 from jeuler.contact.paths import Path, along
-from jeuler.contact.search import Found, next_impacts, rounding, rounding_of_speed
+from jeuler.contact.search import Found, next_impacts, pull, rounding, rounding_of_speed
 
 ENOUGH = 0.1  # of a push: the support that holds against it
 WEDGE = 1e-2  # of the response of free partners: one that is less would have to go far for a small push
@@ -101,10 +101,10 @@ def met(contacts: Contacts, events: Events) -> Array:
 def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look, theta: Array) -> Path:
     """The paths after the impacts of one round, each at its s, (contact,)."""
     now, plastic = met(contacts, events), contacts.first(events.plastic)
-    normal, bend = look.normal, contacts.relative(path.bend)
+    normal = look.normal
     v = look.speed / contacts.dt + look.recession[:, None] * normal
     change = bounce(v, normal, where(plastic, 0, contacts.restitution), contacts.friction)
-    into = jnp.sum(bend * normal, axis=-1) + contacts.dt * contacts.gained
+    into = pull(contacts, path, normal)
     stays = plastic & (into < rounding_of_speed(contacts, path))  # without a push too, as where a solve holds it
     held = where(stays, -into, 0)[:, None] * normal  # no more push into what it stays on
 

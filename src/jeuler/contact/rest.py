@@ -201,10 +201,9 @@ def _at_rest(problem: Problem, small: Array, load: Array | None, may_open: Array
     if load is not None:
         loaded = problem._replace(velocity=load, fastest=contacts.largest(length(load)))
         impulses = loads(loaded, small)
-        others = undetermined(loaded, impulses)
         near = small if may_open is None else may_open / contacts.dt
         stays = (jnp.abs(problem.gap) <= near + problem.weak()) & (loaded.push(impulses) > loaded.weak())
-        unclear = loaded.at_the_limit(impulses) | others
+        unclear = loaded.at_the_limit(impulses) | undetermined(loaded, impulses)
         held = lax.stop_gradient(where(stays[:, None], impulses, 0))
 
     def pressed(w, velocity):  # one of push and parts is 0, or a rounding; or several contacts could hold it

@@ -65,6 +65,22 @@ def convex_stride(gap: Array, slope: Array, bend: Array) -> Array:
     return where(falls, down, where(bend > 0, up, 2))
 
 
+def would_sink(contacts: Contacts, path: Path, look: Look, touching: Array, approaches: Array, still: Array) -> Array:
+    """Which contacts, (contact,), touch without an approach and are pressed on, so that they are to be held from now.
+
+    ``still`` is a speed that is none, m a step. Impacts of their partners come first.
+    """
+    one = approaches.astype(look.gap.dtype)
+    busy = contacts.both(jnp.logical_or, contacts.gather(one, -one) > 0)
+    pulled = pull(contacts, path, look.normal)
+    return touching & (jnp.abs(look.slope) <= still) & (pulled < -2 * still) & ~busy
+
+
+def pull(contacts: Contacts, path: Path, normal: Array) -> Array:
+    """The second derivative of each gap, (contact,), m a step a step, where the normal stays what it is."""
+    return jnp.sum(contacts.relative(path.bend) * normal, axis=-1) + contacts.dt * contacts.gained
+
+
 def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     """The next impact of each contact along the paths as they are now.
 
@@ -82,10 +98,7 @@ def next_impacts(contacts: Contacts, path: Path, slow: Array) -> Found:
     held = jnp.inf if contacts.many else limit
     still = rounding_of_speed(contacts, path) + slow
     approaches = touching & (-first.slope > where(rests, held, still))
-    busy = contacts.gather(*(sign * approaches.astype(path.s.dtype) for sign in (1, -1))) > 0
-    pulled = jnp.sum(contacts.relative(path.bend) * first.normal, axis=-1) + contacts.dt * contacts.gained
-    sinks = touching & ~rests & (jnp.abs(first.slope) <= still) & (pulled < -2 * still)  # at rest, and held no longer
-    sinks = sinks & ~contacts.both(jnp.logical_or, busy)  # impacts come first
+    sinks = would_sink(contacts, path, first, touching & ~rests, approaches, still)
     now = approaches | sinks
     lowest = where(now, start - 1, start)
     turn = length(contacts.relative(path.bend))

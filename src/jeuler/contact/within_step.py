@@ -148,20 +148,20 @@ def at_start_of_fall(contacts: Contacts, x: Array, v: Array, acceleration: Array
 def motion_of_surfaces(contacts: Contacts, path: Path) -> tuple[Array | float, Array | float]:
     """By how much faster each surface recedes where the step ends, m/s, and how far it has receded then, m, (contact,):
     from the place where this path ends."""
-    if not any(moves(collider, contacts.dim) for collider in contacts.colliders):
+    moving = [moves(collider, contacts.dim) for collider in contacts.colliders]
+    if not any(moving):
         return 0.0, 0.0
+    end = path.position(jnp.ones_like(path.s))
 
     def of(collider):
-        if not moves(collider, contacts.dim):
-            return jnp.zeros((2, len(path.x)), path.x.dtype)
         look = jax.vmap(jax.value_and_grad(collider), (None, 0))
-        start, end = path.position(jnp.zeros_like(path.s)), path.position(jnp.ones_like(path.s))
-        _, before = look(contacts.t0, start)
+        _, before = look(contacts.t0, path.x)
         first, _ = look(contacts.t0, end)
         last, after = look(contacts.t0 + contacts.dt, end)
         return jnp.stack([after - before, last - first])
 
-    walls = [of(collider) for collider in contacts.colliders]
+    still = jnp.zeros((2, len(path.x)), path.x.dtype)
+    walls = [of(collider) if goes else still for collider, goes in zip(contacts.colliders, moving, strict=True)]
     return tuple(jnp.concatenate([*walls, jnp.zeros((2, len(contacts.i)), path.x.dtype)], axis=1))
 
 
@@ -199,10 +199,8 @@ def hold(
     else:
         may_open = small + contacts.dt * jnp.abs(contacts.gained)
         rest = at_rest(problem, small, contacts.relative(load) + surface, may_open)
-        support, rub = (
-            y + changes_of(along_it, v + dv - load)
-            for y, along_it in ((rest.support, rest.carried), (rest.rub, lax.stop_gradient(rest.rub)))
-        )
+        in_the_solve = functools.partial(derivative_along, v + dv - load)
+        support, rub = rest.support + in_the_solve(rest.carried), rest.rub + in_the_solve(rest.rub)
         rest = rest._replace(support=support, rub=rub)
     far = (contacts.reach > 0) & (small > 0.05 * contacts.reach)  # from the origin: nobody can say whether they touch
     unresolved = rest.unresolved + jnp.sum(is_deep(contacts, rest.gap, small) | (stays & far)).astype(jnp.int32)
@@ -215,10 +213,10 @@ def hold(
     return path, v + dv + rest.kick, touched, unresolved, lost
 
 
-def changes_of(direction: Array, y: Array) -> Array:
+def derivative_along(y: Array, direction: Array) -> Array:
     """0, with the derivative of the component of y, (particle, dim), along a direction."""
-    component = jnp.sum(unit(direction) * y, axis=-1, keepdims=True)
-    return (component - lax.stop_gradient(component)) * unit(direction)
+    direction = unit(lax.stop_gradient(direction))
+    return jnp.sum(direction * (y - lax.stop_gradient(y)), axis=-1, keepdims=True) * direction
 
 
 def at_start(contacts: Contacts, path: Path, slow: Array) -> tuple[Look, Array, Array]:
