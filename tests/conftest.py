@@ -5,6 +5,7 @@ import gc
 import jax
 import numpy as np
 import pytest
+from compiling import compiled_programs
 from records import sphere_in_water as sphere_in_water
 
 jax.config.update("jax_enable_x64", True)
@@ -19,25 +20,11 @@ def random():
     return np.random.default_rng(20240229)
 
 
-LISTENING = []  # lists of seconds; JAX 0.8 has no way to take a listener back
-
-
-def _listen(name, duration, **_):
-    if name == "/jax/core/compile/backend_compile_duration":
-        for seconds in LISTENING:
-            seconds.append(duration)
-
-
-jax.monitoring.register_event_duration_secs_listener(_listen)
-
-
 @pytest.fixture
 def compiled():
     """A list that grows by the seconds of each program that is compiled."""
-    seconds = []
-    LISTENING.append(seconds)
-    yield seconds
-    LISTENING.pop()
+    with compiled_programs() as seconds:
+        yield seconds
 
 
 collect_ignore = ["_jax/on_a_mesh.py", "particles/on_devices.py"]  # programs that tests run with eight devices

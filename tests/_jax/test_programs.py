@@ -8,24 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import compiled_programs
 
 import jeuler
 from jeuler._jax import programs
 
 GRID = {"dt": 0.25, "num_steps": 4, "save_every": 4}
-COMPILED = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda name, seconds, **_: COMPILED.append(name) if name == "/jax/core/compile/backend_compile_duration" else None
-)
 
 
 def compilations(run, *calls):
     """How many programs are compiled at each call of run with these arguments."""
     counts = []
     for arguments in calls:
-        before = len(COMPILED)
-        jax.block_until_ready(run(*arguments))
-        counts.append(len(COMPILED) - before)
+        with compiled_programs() as compiled:
+            jax.block_until_ready(run(*arguments))
+        counts.append(len(compiled))
     return counts
 
 
@@ -112,11 +109,11 @@ class NetField(eqx.Module):
 def test_the_second_call_compiles_nothing(name):
     run, first, second = RUNS[name]
     jax.block_until_ready(run(first))
-    before = len(COMPILED)
-    got = run(second)
-    jax.block_until_ready(got)
-    jax.block_until_ready(run(first))
-    assert len(COMPILED) == before
+    with compiled_programs() as further:
+        got = run(second)
+        jax.block_until_ready(got)
+        jax.block_until_ready(run(first))
+    assert not further
     if name != "network":
         expected = jax.jit(lambda: run(second))()
         for a, b in zip(*map(jax.tree.leaves, (got, expected)), strict=True):
@@ -354,9 +351,10 @@ def test_a_long_sweep_keeps_memory_flat():
             closure(jnp.array(k))
 
     sweep(np.linspace(1, 2, 100))
-    before, compiled = resident(), len(COMPILED)
-    sweep(np.linspace(2, 3, 1000))
-    assert len(COMPILED) == compiled
+    before = resident()
+    with compiled_programs() as further:
+        sweep(np.linspace(2, 3, 1000))
+    assert not further
     assert resident() - before < 4.0
 
 

@@ -72,10 +72,53 @@ def test_what_a_wall_pushes_rubs_on_it_and_has_the_derivatives_of_that(name):
 
     speed, acceleration, time = 1.0, 2.0, NUM_STEPS * DT
     value, slopes = jax.jit(jax.value_and_grad(way, argnums=(0, 1)))(speed, acceleration)
+    forward = jax.jit(jax.jacfwd(way, argnums=(0, 1)))(speed, acceleration)
+    np.testing.assert_allclose(slopes, forward, rtol=1e-9)
     first_order = 0.3 * acceleration * time * DT / 2
     np.testing.assert_allclose(value, speed * time - 0.3 * acceleration * time**2 / 2, atol=1.01 * first_order)
     np.testing.assert_allclose(slopes[0], time, rtol=1e-9)
     np.testing.assert_allclose(slopes[1], -0.3 * time**2 / 2, atol=1.01 * first_order / acceleration)
+
+
+SURFACES = {  # heights as functions of the time, and the speed of what stands on them at 0.4 s
+    "starts at the end of a step": (lambda t: jnp.maximum(t - 0.1, 0), 1.0),
+    "starts within a step": (lambda t: jnp.maximum(t - 0.11, 0), 1.0),
+    "goes at one speed": (lambda t: 0.5 * t, 0.5),
+    "is at one place": (lambda t: 0 * t, 0.0),
+    "is elsewhere at once": (lambda t: jnp.where(t > 0.105, 0.05, 0.0), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", ["symplectic", "RK4", "implicit"])
+def test_surfaces_as_people_write_them(name):
+    """As a function of one's own or a plane whose point is one; as particles of a pool; with restitution and without."""
+    for height, speed in SURFACES.values():
+        plane = Plane(lambda t, height=height: height(t) * jnp.array([0.0, 1.0]), UP)
+        for surface in (plane, lambda t, p, height=height: p[1] - height(t)):
+            for restitution, alive in ((0.0, None), (0.5, jnp.array([False, True]))):
+                contact = Collisions((surface,), radius=0.1, restitution=restitution)
+                position = jnp.array([[0.0, 0.1]] * (1 if alive is None else 2))
+                velocity = jnp.zeros_like(position).at[-1, 1].set(jax.grad(height)(0.0))
+                state = jeuler.ParticleState(position, velocity, alive=alive)
+                scene = jeuler.Scene((jeuler.Gravity(-9.8 * UP),), (contact,))
+                run = jeuler.simulate(scene, state, dt=DT, num_steps=20, step=STEPS[name])
+                gap = run.y.position[:, -1, 1] - 0.1 - jax.vmap(height)(run.t)
+                np.testing.assert_allclose(gap, 0, atol=1e-12)
+                np.testing.assert_allclose(run.y.velocity[-1, -1, 1], speed, atol=1e-12)
+                assert run.unresolved_contacts == 0
+
+
+def test_a_lift_carries_many_that_find_each_other_to_first_order():
+    row = 0.2 * np.arange(40.0)
+    position = np.stack([np.append(row, row[:10]), np.append(np.full(40, 0.1), np.full(10, 0.3))], axis=1)
+    contact = Collisions((lift(2.0),), "near", 0.1, restitution=0.3, friction=0.3)
+    scene = jeuler.Scene((jeuler.Gravity(-9.8 * UP),), (contact,))
+    state = jeuler.ParticleState(position, 0 * position)
+    for dt in (DT, DT / 2):
+        run = jeuler.simulate(scene, state, dt=dt, num_steps=round(0.4 / dt), step=jeuler.symplectic_euler_step)
+        gap = run.y.position[..., 1] - position[:, 1] - run.t[:, None] ** 2
+        assert np.abs(gap).max() <= 2.0 * dt**2 / 2 + 1e-6  # by what the lift gains in a step, and the iterations leave
+        assert run.unresolved_contacts == 0
 
 
 def test_what_a_lift_leaves_behind_stays_where_it_is():
