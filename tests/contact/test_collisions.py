@@ -77,6 +77,28 @@ def test_newtons_cradle_in_one_step():
     np.testing.assert_allclose(end.position[-1, :, 0], [-0.2, 0, 0.2, 0.4, 1.3], atol=1e-14)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("masses", [(1.0, 2.0), (1.0, 1.0), (2.0, 1.0)])
+@pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.rk4_step])
+def test_plastic_impacts_against_a_wall_go_on_until_nothing_moves(step, masses, dtype):
+    """A heavy ball pushes a light one into the wall: each two impacts leave 2/3 of the speed."""
+    wall = Collisions((Plane([0.0, 0.0], [1.0, 0.0]),), pairs=[(0, 1)], radius=0.1)
+
+    def end(velocity):
+        state = jeuler.ParticleState(np.array([[0.1, 0.3], [0.36, 0.3]], dtype), velocity, np.array(masses, dtype))
+        solution = jeuler.simulate(jeuler.Scene(effects=(wall,)), state, dt=0.02, num_steps=6, step=step)
+        y = solution.y
+        return y.position[-1], (y.velocity[-1], solution.unresolved_contacts)
+
+    velocity = np.array([[0.0, 0.0], [-1.0, 0.0]], dtype)
+    slopes, (last, unresolved) = jax.jacrev(end, has_aux=True)(velocity)
+    small = 1e2 * np.finfo(dtype).eps
+    np.testing.assert_allclose(end(velocity)[0], [[0.1, 0.3], [0.3, 0.3]], atol=small)
+    np.testing.assert_allclose(last, 0, atol=small)
+    np.testing.assert_allclose(slopes[:, 0, :, 0], 0, atol=small)  # of places along the wall's normal
+    assert unresolved == 0
+
+
 def test_balls_keep_momentum_and_elastic_ones_energy():
     mass = jnp.array([1.0, 2.0, 5.0])
     state = jeuler.ParticleState(

@@ -18,7 +18,7 @@ from jeuler.contact.colliders import as_collider, check_collider
 from jeuler.contact.contacts import Contacts
 from jeuler.contact.within_step import answer, at_start_of_fall, resolve
 
-FEW_PAIRS = 32  # of them, XLA's faster loops do not pay for their compilation
+FEW_PAIRS = 32  # of them, XLA's faster loops do not pay for their compilation, and many rounds do not take long
 
 
 @component(static=("pairs", "max_bounces", "capacity"), positive=("radius", "restitution", "friction"))
@@ -45,7 +45,8 @@ class Collisions:
       restitution: 1 elastic, 0 no bounce, (). Differentiable.
       friction: Coulomb's coefficient, (). Differentiable.
       max_bounces: rounds of impacts that are followed within one step, those that come at once in different places in
-        one; None: 8, with pairs 32. What is left is counted. Static.
+        one; None: 8, with pairs 32, and with up to 32 pairs 191, as plastic impacts in a row leave a part of the speed
+        each time. What is left is counted. Static.
       capacity: with "near", the most balls that may be within the reach of one in a step, 2 max(radius) and four times
         the longest way; None: 24, enough for balls of like size. Those beyond it are counted too. Static.
     Returns: called as an effect ``(t, dt, previous, state, key)``, the state at the end of the step. Without
@@ -152,7 +153,9 @@ class Collisions:
     def _rounds(self) -> int:
         if self.max_bounces is not None:
             return self.max_bounces
-        return 32 if self.pairs else 8
+        if not self.pairs:
+            return 8
+        return 32 if self.pairs == "near" or len(self.pairs) > FEW_PAIRS else 191
 
     def check(self, particles: int, dim: int) -> None:
         for i, j in () if self.pairs == "near" else self.pairs:

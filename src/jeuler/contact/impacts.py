@@ -21,6 +21,7 @@ from jeuler.contact.contacts import THERE, Contacts, Look, rows
 from jeuler.contact.paths import Path, along
 from jeuler.contact.search import Found, next_impacts, pull, rounding, rounding_of_speed
 
+AT_ONCE = 32  # rounds that are skipped together where none of them has an impact
 ENOUGH = 0.1  # of a push: the support that holds against it
 WEDGE = 1e-2  # of the response of free partners: one that is less would have to go far for a small push
 
@@ -207,7 +208,8 @@ def schedule(
     none = jnp.full(contacts.particles, -1, jnp.int32)
     no = jnp.zeros(contacts.particles, bool)
     empty = Events(none, jnp.zeros_like(path.s), no, no)
-    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds + 1, *x.shape)), empty)
+    room = rounds + 1 if rounds < AT_ONCE else -(-(rounds + 1) // AT_ONCE) * AT_ONCE
+    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (room, *x.shape)), empty)
 
     def play(path, found, k):
         events = choose(contacts, found)
@@ -307,9 +309,13 @@ def go_through(contacts: Contacts, path: Path, events: Events, theta: Array) -> 
     def again(path, events):
         return strike(contacts, path, events, *meet(contacts, path, events), theta)
 
-    @recomputed
-    def one(path, events):
-        happens = anywhere(events.contact >= 0)
-        return lax.cond(happens, again, lambda path, _: path, path, events), None
+    def where_any(happens, path, events):
+        return lax.cond(anywhere(events.contact >= 0), happens, lambda path, _: path, path, events), None
 
-    return lax.scan(one, path, events)[0]
+    one = recomputed(functools.partial(where_any, again))
+
+    def some(path, events):
+        return where_any(lambda path, events: lax.scan(one, path, events)[0], path, events)
+
+    several = jax.tree.map(lambda x: x.reshape(-1, min(len(x), AT_ONCE), *x.shape[1:]), events)
+    return lax.scan(some, path, several)[0]
