@@ -99,6 +99,25 @@ def test_plastic_impacts_against_a_wall_go_on_until_nothing_moves(step, masses, 
     assert unresolved == 0
 
 
+@pytest.mark.parametrize("colliders", [(), (Plane([0.0, 0.0], [1.0, 0.0]),)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_approach_that_may_be_rounding_is_no_impact(dtype, colliders):
+    """Extrapolated steps leave twelve units in the last place between elastic balls that touch."""
+    eps, dt = np.finfo(dtype).eps, 1 / 64
+    touching = Collisions(colliders, pairs=[(0, 1)], radius=0.125, restitution=1.0, friction=0.3)
+    position = np.array([[0.125, 0.5], [0.375, 0.5]], dtype)
+
+    def end(velocity):
+        run = jeuler.simulate(
+            jeuler.Scene(effects=(touching,)), jeuler.ParticleState(position, velocity), dt=dt, num_steps=1
+        )
+        return run.y.velocity[-1]
+
+    velocity = np.array([[12 * eps / dt, 0.0], [0.0, 0.0]], dtype)
+    np.testing.assert_allclose(end(velocity), 0, atol=np.max(velocity))
+    np.testing.assert_allclose(jax.jacrev(end)(velocity).reshape(4, 4), np.eye(4), atol=eps)
+
+
 def test_balls_keep_momentum_and_elastic_ones_energy():
     mass = jnp.array([1.0, 2.0, 5.0])
     state = jeuler.ParticleState(

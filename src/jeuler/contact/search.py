@@ -30,7 +30,7 @@ class Found(NamedTuple):
 
 def rounding_of_speed(contacts: Contacts, path: Path) -> Array:
     """What a speed of approach of 0 may look like, m a step."""
-    return contacts.both(jnp.add, 4 * rounding(path))
+    return contacts.both(jnp.add, 16 * rounding(path))
 
 
 def rounding(path: Path) -> Array:
