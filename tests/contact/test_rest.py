@@ -7,6 +7,8 @@ import pytest
 
 import jeuler
 from jeuler import Box, Collisions, Plane
+from jeuler.contact.impacts import drives
+from jeuler.contact.paths import free_path
 
 FLOOR = Plane([0.0, 0.0], [0.0, 1.0])
 GRAVITY = jeuler.Gravity([0.0, -9.8])
@@ -242,6 +244,14 @@ def test_a_bounce_turns_friction_around_and_lets_nothing_sink(step):
     energy = np.sum(end.velocity**2 / 2 + 9.8 * end.position * np.array([0.0, 1.0]), axis=(1, 2))
     assert (np.diff(energy) < 1e-9).all()
     assert (end.position[:, 0, 1] > 0.1 - 1e-9).all()
+
+
+@pytest.mark.parametrize(("rub", "turned"), [(-0.01, True), (-1e-9, False), (-1e-57, False), (0.0, False)])
+def test_only_friction_above_rounding_is_turned_around_by_a_bounce(rub, turned):
+    """The direction of a rounding means nothing: turned around, it took the derivative of the support with it."""
+    slides, load = jnp.array([[1.0, 0.0]]), jnp.array([[0.0, 0.1]])
+    path = free_path(jnp.zeros((1, 2)), 0.02 * slides, load, 0.02, load, rub * slides)
+    assert drives(path, path.s, -0.02 * slides).item() == turned
 
 
 def test_a_scene_does_not_depend_on_the_others_of_its_batch():

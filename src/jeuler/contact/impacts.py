@@ -18,7 +18,7 @@ from jeuler._core.vectors import direction, length, total
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import THERE, Contacts, Look, rows
-from jeuler.contact.paths import Path, along
+from jeuler.contact.paths import SMALL_PART, Path, along
 from jeuler.contact.search import Found, next_impacts, pull, rounding, rounding_of_speed
 
 AT_ONCE = 32  # rounds that are skipped together where none of them has an impact
@@ -170,8 +170,10 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
 
 def drives(path: Path, s: Array, speed: Array) -> Array:
     """Whether the friction of what a particle stays on, which has held its dx/ds back, would drive it from s on."""
+    _, bend, support = path.sizes()
+    rubs = length(lax.stop_gradient(path.rub)) > SMALL_PART * (bend + support)  # by more than a rounding
     before, after = along(path.speed(s), path.rub), along(speed, path.rub)
-    return ((before <= 0) & (after > 0))[:, None]
+    return (rubs & (before <= 0) & (after > 0))[:, None]
 
 
 def leaves_its_support(path: Path, s: Array, speed: Array) -> Array:
