@@ -81,7 +81,7 @@ def test_newtons_cradle_in_one_step():
 @pytest.mark.parametrize("masses", [(1.0, 2.0), (1.0, 1.0), (2.0, 1.0)])
 @pytest.mark.parametrize("step", [jeuler.euler_step, jeuler.rk4_step])
 def test_plastic_impacts_against_a_wall_go_on_until_nothing_moves(step, masses, dtype):
-    """A heavy ball pushes a light one into the wall: each two impacts leave 2/3 of the speed."""
+    """One ball pushes another into the wall: each two impacts leave 2/3 of the speed if its mass is twice the other's."""
     wall = Collisions((Plane([0.0, 0.0], [1.0, 0.0]),), pairs=[(0, 1)], radius=0.1)
 
     def end(velocity):
@@ -97,6 +97,26 @@ def test_plastic_impacts_against_a_wall_go_on_until_nothing_moves(step, masses, 
     np.testing.assert_allclose(last, 0, atol=small)
     np.testing.assert_allclose(slopes[:, 0, :, 0], 0, atol=small)  # of places along the wall's normal
     assert unresolved == 0
+
+
+@pytest.mark.parametrize("max_bounces", [1, 30, 31, 32, 33, 63, 64, 191])
+def test_as_many_rounds_as_asked_for_are_followed_and_differentiated(max_bounces):
+    """A ball goes to and fro between walls in one step: the last bounce that is followed, and one more, which is counted."""
+    walls = (Plane([0.0], [1.0]), Plane([1.0], [-1.0]))
+    box = Collisions(walls, restitution=1.0, max_bounces=max_bounces)
+
+    def end(speed):
+        state = jeuler.ParticleState(jnp.array([[0.5]]), speed[None, None])
+        solution = jeuler.simulate(jeuler.Scene(effects=(box,)), state, dt=1.0, num_steps=1)
+        return solution.y.position[-1, 0, 0], solution.unresolved_contacts
+
+    bounces = min(max_bounces, 60)
+    (place, left), slope = jax.value_and_grad(end, has_aux=True)(bounces + 0.25)
+    sign = (-1) ** bounces
+    np.testing.assert_allclose((place, slope), (0.5 + 0.25 * sign, sign), rtol=1e-12)
+    assert left == 0
+    if max_bounces < 60:
+        assert end(jnp.float64(max_bounces + 1.25))[1] == 1
 
 
 @pytest.mark.parametrize("colliders", [(), (Plane([0.0, 0.0], [1.0, 0.0]),)])

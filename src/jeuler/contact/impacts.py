@@ -18,7 +18,7 @@ from jeuler._core.vectors import direction, length, total
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
 from jeuler.contact.contacts import THERE, Contacts, Look, rows
-from jeuler.contact.paths import SMALL_PART, Path, along
+from jeuler.contact.paths import Path, along
 from jeuler.contact.search import Found, next_impacts, pull, rounding, rounding_of_speed
 
 AT_ONCE = 32  # rounds that are skipped together where none of them has an impact
@@ -120,7 +120,7 @@ def strike(contacts: Contacts, path: Path, events: Events, s: Array, look: Look,
     hold = hold - where(off, path.support, 0)
     support, turned = path.support + hold, hit & drives(path, own_s, speed)
     hold = hold - where(turned, path.rub, 0)
-    new = jnp.abs(along(hold, support)) > 1e-6 * sum(path.sizes()[1:])
+    new = jnp.abs(along(hold, support)) > path.least()
     return Path(
         own_s,
         where(hit, path.position(own_s), path.x),
@@ -144,8 +144,8 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
     """
     if contacts.alone:
         return contacts.move(change)
-    _, bend, support = path.sizes()
-    least = 1e-6 * (bend + support)  # of a push; what is less is left by iterations
+    _, _, support = path.sizes()
+    least = path.least()
     size, upward = direction(path.ground)
     upward = where(size > least[:, None], upward, 0)
     on_balls = (support > least) & ~jnp.any(upward != 0, axis=(0, 2))
@@ -170,8 +170,7 @@ def shared(contacts: Contacts, path: Path, normal: Array, change: Array) -> Arra
 
 def drives(path: Path, s: Array, speed: Array) -> Array:
     """Whether the friction of what a particle stays on, which has held its dx/ds back, would drive it from s on."""
-    _, bend, support = path.sizes()
-    rubs = length(lax.stop_gradient(path.rub)) > SMALL_PART * (bend + support)  # by more than a rounding
+    rubs = length(lax.stop_gradient(path.rub)) > path.least()
     before, after = along(path.speed(s), path.rub), along(speed, path.rub)
     return (rubs & (before <= 0) & (after > 0))[:, None]
 
@@ -210,8 +209,7 @@ def schedule(
     none = jnp.full(contacts.particles, -1, jnp.int32)
     no = jnp.zeros(contacts.particles, bool)
     empty = Events(none, jnp.zeros_like(path.s), no, no)
-    room = rounds + 1 if rounds < AT_ONCE else -(-(rounds + 1) // AT_ONCE) * AT_ONCE
-    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (room, *x.shape)), empty)
+    record = jax.tree.map(lambda x: jnp.broadcast_to(x, (rounds + 1, *x.shape)), empty)
 
     def play(path, found, k):
         events = choose(contacts, found)
@@ -319,5 +317,9 @@ def go_through(contacts: Contacts, path: Path, events: Events, theta: Array) -> 
     def some(path, events):
         return where_any(lambda path, events: lax.scan(one, path, events)[0], path, events)
 
-    several = jax.tree.map(lambda x: x.reshape(-1, min(len(x), AT_ONCE), *x.shape[1:]), events)
+    rounds = len(events.contact)
+    at_once = min(rounds, AT_ONCE)
+    none = jax.tree.map(lambda x: jnp.zeros((-rounds % at_once, *x.shape[1:]), x.dtype), events)
+    none = none._replace(contact=none.contact - 1)
+    several = jax.tree.map(lambda x, y: jnp.concatenate([x, y]).reshape(-1, at_once, *x.shape[1:]), events, none)
     return lax.scan(some, path, several)[0]

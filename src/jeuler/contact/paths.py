@@ -47,6 +47,11 @@ class Path(NamedTuple):
         """The lengths of way, bend and support, (particle,), by which it is decided what happens."""
         return tuple(length(lax.stop_gradient(jnp.stack([self.way, self.bend, self.support]))))
 
+    def least(self) -> Array:
+        """What of bend, (particle,), m, is so little that nothing is to be read from it: iterations leave as much."""
+        _, bend, support = self.sizes()
+        return SMALL_PART * (bend + support)
+
     def speed(self, s: Array) -> Array:
         """dx/ds, m a step."""
         return self.way + (s - self.s)[:, None] * self.bend
