@@ -14,6 +14,7 @@ from jeuler._core.choice import where
 from jeuler._core.vectors import direction, length, total, unit
 from jeuler.contact.colliders import Plane
 from jeuler.contact.linear import DENSE_UP_TO
+from jeuler.contact.partners import BY_SLICES, THERE, Partners, add, rows
 from jeuler.contact.paths import Path
 from jeuler.graphs.cells import rows_of_neighbours
 
@@ -21,13 +22,7 @@ NARROWER = 8  # reaches, each half of the one before, that are tried where pairs
 WAY_OF_FORCES = 1e3  # of an approach that is none, is the way that the forces of a step make
 TOUCH, LIFT = 8, 16  # units in the last place of the coordinates
 ROW = 24  # balls within reach of one: 12 can touch one of their size in space
-THERE: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}  # of an index: it needs no check
 CANDIDATES = 2  # pairs followed in a step, for each particle and dimension, where there are many more of them
-
-
-def rows(y: Array, k: Array) -> Array:
-    """y[k] of indices that are there."""
-    return y.at[k].get(**THERE)
 
 
 class Look(NamedTuple):
@@ -59,8 +54,8 @@ class Contacts:
     radius: Array  # (particle,), m
     inverse_mass: Array  # (particle,), 1/kg, 0 for what cannot move
     alive: Array  # (particle,)
-    i: Array  # (pair,), the first particle
-    j: Array
+    i: Partners  # (pair,), the first particle
+    j: Partners
     listed: Array  # (pair,), False in slots without a pair
     parts: tuple[Array, Array]  # of each, (pair,): what of a change of their relative velocity falls to either
     possible: Array  # (contact,), which can occur: both partners are alive, and one of them can move
@@ -81,7 +76,7 @@ class Contacts:
         if not self.row:
             named = np.array(collisions.pairs, np.int32).reshape(-1, 2)
             self.alone |= not self.colliders and len(np.unique(named)) == named.size
-            i, j = (jnp.asarray(k) for k in named.T)
+            i, j = (tuple(k.tolist()) if 0 < len(named) <= BY_SLICES else jnp.asarray(k) for k in named.T)
             self._follow(i, j, jnp.ones(len(i), bool))
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
@@ -90,18 +85,19 @@ class Contacts:
         self.axis: str | None = getattr(collisions, "axis", None)  # of the devices that share the particles
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        fixed = ("particles", "dim", "row", "alone", "axis")
+        few = ("i", "j") if isinstance(vars(self).get("i"), tuple) else ()
+        fixed = {name: getattr(self, name) for name in ("particles", "dim", "row", "alone", "axis", *few)}
         names = tuple(name for name in vars(self) if name not in fixed)
-        return tuple(getattr(self, name) for name in names), (names, *(getattr(self, name) for name in fixed))
+        return tuple(getattr(self, name) for name in names), (names, *fixed.items())
 
     @classmethod
     def tree_unflatten(cls, kept: tuple[Any, ...], values: tuple[Any, ...]) -> Contacts:
         self = object.__new__(cls)
-        names, self.particles, self.dim, self.row, self.alone, self.axis = kept
-        vars(self).update(zip(names, values, strict=True))
+        names, *fixed = kept
+        vars(self).update(fixed, **dict(zip(names, values, strict=True)))
         return self
 
-    def _follow(self, i: Array, j: Array, listed: Array) -> None:
+    def _follow(self, i: Partners, j: Partners, listed: Array) -> None:
         """Have these pairs, (pair,), and what is known of them before they move."""
         self.i, self.j, self.listed = i, j, listed
         first, second = rows(self.inverse_mass, i), rows(self.inverse_mass, j)
@@ -180,7 +176,8 @@ class Contacts:
         kept = jnp.nonzero((apart <= reaches[widest]) & alive, size=capacity, fill_value=0)[0]
         number = jnp.minimum(numbers[widest], capacity)
         self.left_out = (numbers[0] - number).astype(jnp.int32)
-        self._follow(rows(self.i, kept), rows(self.j, kept), jnp.arange(capacity) < number)
+        i, j = rows(jnp.asarray(self.i), kept), rows(jnp.asarray(self.j), kept)
+        self._follow(i, j, jnp.arange(capacity) < number)
 
     def _find(self, path: Path) -> None:
         """The pairs of all balls that can meet in this step, by a list of cells; those beyond the rows are counted."""
@@ -221,22 +218,20 @@ class Contacts:
 
     def relative(self, y: Array) -> Array:
         """y of the first partner less that of the second; of a particle at a collider just y."""
-        return jnp.concatenate(
-            [*[y] * len(self.colliders), *([rows(y, self.i) - rows(y, self.j)] if len(self.i) else [])]
-        )
+        pairs = [rows(y, self.i) - rows(y, self.j)] if len(self.i) else []
+        return jnp.concatenate([*[y] * len(self.colliders), *pairs])
 
     def both(self, join: Callable[[Array, Array], Array], y: Array) -> Array:
         """join(y of the first, y of the second), where there is no second y of the first; y is (particle,)."""
-        return jnp.concatenate(
-            [*[y] * len(self.colliders), *([join(rows(y, self.i), rows(y, self.j))] if len(self.i) else [])]
-        )
+        pairs = [join(rows(y, self.i), rows(y, self.j))] if len(self.i) else []
+        return jnp.concatenate([*[y] * len(self.colliders), *pairs])
 
     def gather(self, first: Array, second: Array) -> Array:
         """The sums (particle, ...) of what contacts add to the first and take from the second partner."""
         total = self._of_walls(first)
         if len(self.i):
-            total = total.at[self.i].add(first[self.walls :], **THERE)
-            total = total.at[self.j].add(-second[self.walls :], **THERE)
+            total = add(total, self.i, first[self.walls :])
+            total = add(total, self.j, -second[self.walls :])
         return total
 
     def _of_walls(self, change: Array) -> Array:
@@ -257,7 +252,7 @@ class Contacts:
         if len(self.i):
             pairs = change[self.walls :]
             for body, part in zip((self.i, self.j), self.parts, strict=True):
-                total = total.at[body].add(part[:, None] * pairs, **THERE)
+                total = add(total, body, part[:, None] * pairs)
         return total
 
     def close(self, active: Array, gap: Array) -> Array:
@@ -277,8 +272,10 @@ class Contacts:
             return self, numbers
         kept = jnp.nonzero(of, size=capacity, fill_value=self.count)[0]
         body = jnp.arange(self.particles, dtype=jnp.int32)
-        i = jnp.concatenate([jnp.tile(body, len(self.colliders)), self.i.astype(jnp.int32)])
-        j = jnp.pad(self.j.astype(jnp.int32), (self.walls, 0), constant_values=self.particles)  # one more, which stays
+        i = jnp.concatenate([jnp.tile(body, len(self.colliders)), jnp.asarray(self.i, jnp.int32)])
+        j = jnp.pad(
+            jnp.asarray(self.j, jnp.int32), (self.walls, 0), constant_values=self.particles
+        )  # one more, which stays
         i, j = (where(kept < self.count, k[kept], self.particles) for k in (i, j))
         return Chosen(i, j, jnp.pad(self.inverse_mass, (0, 1)), self.friction, self.dt, kept < self.count), kept
 
@@ -317,11 +314,14 @@ class Contacts:
     def _balls(self, path: Path, s: Array) -> tuple[Array, Array]:
         """Place and dx/ds of the first ball of each pair relative to the second, (pair, dim), at its own s."""
         table = jnp.concatenate([path.x, path.way, path.bend, path.s[:, None]], axis=1)
-        both = rows(table, jnp.stack([self.i, self.j]))
-        x, way, bend, since = jnp.split(both, [self.dim, 2 * self.dim, 3 * self.dim], axis=2)
-        part = s[self.walls :, None] - since
-        place, speed = x + part * (way + part / 2 * bend), way + part * bend
-        return place[0] - place[1], speed[0] - speed[1]
+
+        def of(k):
+            x, way, bend, since = jnp.split(rows(table, k), [self.dim, 2 * self.dim, 3 * self.dim], axis=1)
+            part = s[self.walls :, None] - since
+            return x + part * (way + part / 2 * bend), way + part * bend
+
+        (x, speed), (of_second, speed_of_second) = of(self.i), of(self.j)
+        return x - of_second, speed - speed_of_second
 
     def roundoff(self, x: Array) -> Array:
         """How large a gap of zero may come out by roundoff, (contact,), m."""

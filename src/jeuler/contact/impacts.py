@@ -17,7 +17,8 @@ from jeuler._core.choice import where
 from jeuler._core.vectors import direction, length, total
 from jeuler._jax.anywhere import anywhere
 from jeuler._jax.root import root
-from jeuler.contact.contacts import THERE, Contacts, Look, rows
+from jeuler.contact.contacts import Contacts, Look
+from jeuler.contact.partners import least, put, rows
 from jeuler.contact.paths import Path, along
 from jeuler.contact.search import Found, next_impacts, pull, rounding, rounding_of_speed
 
@@ -54,19 +55,19 @@ def choose(contacts: Contacts, found: Found) -> Events:
     n, numbers = contacts.particles, jnp.arange(contacts.count)
     i, j, pairs = contacts.i, contacts.j, slice(contacts.walls, None)
 
-    def at_both(value, least):
-        return value.at[i].min(least, **THERE).at[j].min(least, **THERE)
+    def at_both(value, of_pairs):
+        return least(least(value, i, of_pairs), j, of_pairs)
 
-    def least(per_contact, initial):
+    def earliest(per_contact, initial):
         value = jnp.min(per_contact[: contacts.walls].reshape(-1, n), axis=0, initial=initial)
         return at_both(value, per_contact[pairs]) if len(i) else value
 
-    first = least(found.s, jnp.inf)
+    first = earliest(found.s, jnp.inf)
     if len(i):
         first = at_both(first, where(contacts.listed, jnp.minimum(rows(first, i), rows(first, j)), jnp.inf))
     now = jnp.isfinite(found.s) & (found.s <= contacts.both(jnp.minimum, first))
     rank = where(now, numbers, contacts.count)
-    winner = least(rank, contacts.count)
+    winner = earliest(rank, contacts.count)
     chosen = where(winner < contacts.walls, winner, contacts.count)
     if len(i):  # a pair goes on only if it is the first of both
         agreed = now[pairs] & (rows(winner, i) == rank[pairs]) & (rows(winner, j) == rank[pairs])
@@ -195,9 +196,8 @@ def spread(contacts: Contacts, y: Array, per_contact: Array, met: Array) -> Arra
         own = slice(k * n, (k + 1) * n)
         y = where(met[own], per_contact[own], y)
     if len(contacts.i):
-        pairs = per_contact[contacts.walls :]
         for body in (contacts.i, contacts.j):
-            y = y.at[where(met[contacts.walls :], body, n)].set(pairs, mode="drop", wrap_negative_indices=False)
+            y = put(y, body, per_contact[contacts.walls :], met[contacts.walls :])
     return y
 
 

@@ -16,8 +16,9 @@ from jeuler._core.vectors import length, unit
 from jeuler._jax.anywhere import where_needed
 from jeuler._jax.found import found, found_p
 from jeuler.contact.colliders import moves
-from jeuler.contact.contacts import THERE, Contacts, Look
+from jeuler.contact.contacts import Contacts, Look
 from jeuler.contact.impacts import by_chance, go_through, schedule
+from jeuler.contact.partners import most
 from jeuler.contact.paths import Path, free_path, share_of_the_force
 from jeuler.contact.rest import REST, Problem, at_rest, together
 from jeuler.contact.search import impulsive_limit
@@ -236,7 +237,7 @@ def is_deep(contacts: Contacts, gap: Array, small: Array) -> Array:
 
 def _touched(contacts: Contacts, on: Array) -> Array:
     wall, pairs = _touches_a_collider(contacts, on), on[contacts.walls :]
-    return wall.at[contacts.i].max(pairs, **THERE).at[contacts.j].max(pairs, **THERE) if len(contacts.i) else wall
+    return most(most(wall, contacts.i, pairs), contacts.j, pairs) if len(contacts.i) else wall
 
 
 def _touches_a_collider(contacts: Contacts, on: Array) -> Array:
