@@ -10,7 +10,12 @@ from jeuler import Collisions, Plane
 
 DURATION, DT, BALLS, PLANES = 0.6, 0.01, 4, 3
 STEPS = (jeuler.euler_step, jeuler.symplectic_euler_step, jeuler.heun_step, jeuler.rk4_step)
-VELOCITY_SHIFT = {jeuler.euler_step: -0.5, jeuler.symplectic_euler_step: 0.5}  # of the parabola they follow, in dt g
+VELOCITY_SHIFT = {  # of the parabola they follow, in dt g
+    jeuler.euler_step: -0.5,
+    jeuler.symplectic_euler_step: 0.5,
+    jeuler.implicit_euler_step: 0.5,
+    jeuler.linearly_implicit_euler_step: 0.5,
+}
 
 
 def run(numbers, dt, method, *, steps, num_steps):
