@@ -7,7 +7,7 @@ import pytest
 
 import jeuler
 from jeuler import Collisions
-from jeuler.contact.partners import BY_SLICES, add, least, most, put, rows
+from jeuler.contact.partners import AMONG, BY_SLICES, add, least, most, put, rows
 
 INDICES = [(0,), (3,), (2, 0), (1, 1), (0, 3, 3), (3, 1, 0)]
 
@@ -63,6 +63,20 @@ def test_runs_with_slices_are_runs_with_indices(far):
     ]
     for own, other in zip(*slopes, strict=True):
         np.testing.assert_allclose(own, other, rtol=1e-9, atol=1e-11)
+
+
+def test_one_pair_among_many_particles_does_not_take_a_slice_of_each():
+    def size(particles):
+        zero = jnp.zeros((particles, 2))
+
+        def end(x):
+            scene = jeuler.Scene(effects=(Collisions(pairs=[(0, 1)], radius=0.1),))
+            return jeuler.simulate(scene, jeuler.ParticleState(x, zero), dt=0.1, num_steps=1).y.position
+
+        return str(jax.make_jaxpr(end)(zero)).count("\n")
+
+    assert size(AMONG) > 0
+    assert size(20 * AMONG) < 1.2 * size(AMONG + 1)
 
 
 @pytest.mark.parametrize(("pairs", "rounds"), [(0, 8), (1, 191), (32, 191), (33, 32)])

@@ -14,7 +14,7 @@ from jeuler._core.choice import where
 from jeuler._core.vectors import direction, length, total, unit
 from jeuler.contact.colliders import Plane
 from jeuler.contact.linear import DENSE_UP_TO
-from jeuler.contact.partners import BY_SLICES, THERE, Partners, add, rows
+from jeuler.contact.partners import AMONG, BY_SLICES, THERE, Partners, add, rows
 from jeuler.contact.paths import Path
 from jeuler.graphs.cells import rows_of_neighbours
 
@@ -76,7 +76,8 @@ class Contacts:
         if not self.row:
             named = np.array(collisions.pairs, np.int32).reshape(-1, 2)
             self.alone |= not self.colliders and len(np.unique(named)) == named.size
-            i, j = (tuple(k.tolist()) if 0 < len(named) <= BY_SLICES else jnp.asarray(k) for k in named.T)
+            few = 0 < len(named) <= BY_SLICES and self.particles <= AMONG
+            i, j = (tuple(k.tolist()) if few else jnp.asarray(k) for k in named.T)
             self._follow(i, j, jnp.ones(len(i), bool))
         self.left_out = jnp.int32(0)
         self.lift: list[Array | float] = [0.0] * len(self.colliders)
@@ -273,9 +274,8 @@ class Contacts:
         kept = jnp.nonzero(of, size=capacity, fill_value=self.count)[0]
         body = jnp.arange(self.particles, dtype=jnp.int32)
         i = jnp.concatenate([jnp.tile(body, len(self.colliders)), jnp.asarray(self.i, jnp.int32)])
-        j = jnp.pad(
-            jnp.asarray(self.j, jnp.int32), (self.walls, 0), constant_values=self.particles
-        )  # one more, which stays
+        further = self.particles  # one more, which stays
+        j = jnp.pad(jnp.asarray(self.j, jnp.int32), (self.walls, 0), constant_values=further)
         i, j = (where(kept < self.count, k[kept], self.particles) for k in (i, j))
         return Chosen(i, j, jnp.pad(self.inverse_mass, (0, 1)), self.friction, self.dt, kept < self.count), kept
 

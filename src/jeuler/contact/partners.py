@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 THERE: dict[str, Any] = {"mode": "promise_in_bounds", "wrap_negative_indices": False}  # of an index: it needs no check
-BY_SLICES = 3  # pairs
+BY_SLICES, AMONG = 3, 8  # pairs at most, and particles at most, each of which takes a slice
 
 Partners = Array | tuple[int, ...]  # of each pair a particle; a tuple of few
 
