@@ -26,7 +26,7 @@ def estimate_oscillation(times: np.ndarray, values: np.ndarray) -> Oscillation:
     """The strongest line in the spectrum of (time, column) data, and how fast the motion dies away.
 
     A start for a fit: the frequency to about a tenth of a line's width, the decay from the two halves of the record.
-    NaN = not observed; the sampling may be uneven. Time and memory grow as N log N.
+    NaN = not observed; the sampling may be uneven. Memory grows as the rows.
     """
     span = times[-1] - times[0]
     moving = [c for c in values.T if np.isfinite(c).sum() >= 4 and np.ptp(c[np.isfinite(c)]) > 0]

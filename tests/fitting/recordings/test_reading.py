@@ -3,8 +3,9 @@
 import gzip
 import importlib
 import io
-import time
+import sys
 import zipfile
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -227,12 +228,32 @@ def test_not_a_source():
         jeuler.read_trajectory(3)
 
 
-def test_hundred_thousand_rows_are_quick(random):
-    lines = "\n".join(f"{k / 100:.2f},{x:.6f}" for k, x in enumerate(random.standard_normal(100_000)))
-    source = io.StringIO("t,x\n" + lines)
-    started = time.process_time()
-    assert len(jeuler.read_trajectory(source).times) == 100_000
-    assert time.process_time() - started < 1.0  # 0.2 s on a quiet machine
+@contextmanager
+def counted_calls():
+    """A list whose one number is how many Python and C functions were called."""
+    count, before = [0], sys.getprofile()
+
+    def called(frame, event, argument):
+        count[0] += event in ("call", "c_call")
+
+    sys.setprofile(called)
+    try:
+        yield count
+    finally:
+        sys.setprofile(before)
+
+
+def test_the_work_grows_as_the_rows(random):
+    """Calls, not seconds, which are those of the machine; benchmarks/recordings.py has the seconds."""
+    calls = {}
+    for rows in (10_000, 100_000):
+        lines = "\n".join(f"{k / 100:.2f},{x:.6f}" for k, x in enumerate(random.standard_normal(rows)))
+        source = io.StringIO("t,x\n" + lines)
+        with counted_calls() as count:
+            assert len(jeuler.read_trajectory(source).times) == rows
+        calls[rows] = count[0]
+    assert calls[100_000] < 10.1 * calls[10_000]
+    assert calls[100_000] < 10 * 100_000
 
 
 @pytest.mark.parametrize(
